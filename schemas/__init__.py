@@ -1,0 +1,33 @@
+"""What a table is: every column once with type, unit, frame and meaning; tables list columns, key and version.
+
+`arrow_schema` gives the Arrow schema that is written into every Parquet file, `check` compares a schema found on disk
+with it, `python -m schemas` prints the data dictionary.
+"""
+
+from schemas.arrow import SchemaMismatch, arrow_schema, check
+from schemas.column import AS_LOGGED, Column, Table
+from schemas.tables import (
+    HISTORY_TABLES,
+    SIGNAL_TABLES,
+    STAGE_TABLES,
+    TABLES,
+    stage_columns,
+    table_columns,
+    table_key,
+)
+
+__all__ = [
+    "AS_LOGGED",
+    "HISTORY_TABLES",
+    "SIGNAL_TABLES",
+    "STAGE_TABLES",
+    "TABLES",
+    "Column",
+    "SchemaMismatch",
+    "Table",
+    "arrow_schema",
+    "check",
+    "stage_columns",
+    "table_columns",
+    "table_key",
+]

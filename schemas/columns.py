@@ -1,0 +1,256 @@
+"""Every column, once: type, unit, frame, meaning."""
+
+from __future__ import annotations
+
+import pyarrow as pa
+
+from schemas.column import AS_LOGGED, Column
+
+_F64 = pa.float64()
+_I32 = pa.int32()
+_I64 = pa.int64()
+_TEXT = pa.string()
+_FLAG = pa.bool_()
+
+_SENSOR_MEANING = {
+    "gyroscope": "angular rate about",
+    "accelerometer": "acceleration along",
+    "magnetometer": "magnetic field along",
+}
+
+
+def _triad(
+    sensor: str, prefix: str = "", remark: str = "as the log has it, sensor axes, no sign or scale applied"
+) -> tuple[Column, ...]:
+    return tuple(
+        Column(
+            f"{prefix}{sensor}_{axis}",
+            _F64,
+            AS_LOGGED,
+            f"{_SENSOR_MEANING[sensor]} the sensor's {axis} axis, {remark}",
+            sensor,
+        )
+        for axis in "xyz"
+    )
+
+
+# --- time and place in a recording
+T_NS = Column(
+    "t_ns", _I64, "ns", "time stamp of the sample on the clock of its own source, nanoseconds since that clock's epoch"
+)
+SEGMENT = Column("segment", _I32, "1", "number of the excited stretch of the flight, from 0, in order of time")
+START_NS = Column("start_ns", _I64, "ns", "first sample of the segment, IMU clock")
+END_NS = Column("end_ns", _I64, "ns", "last sample of the segment, IMU clock")
+RATE_RMS = Column(
+    "rate_rms", _F64, AS_LOGGED, "rms of the logged angular rate vector over the segment, its mean removed", "gyroscope"
+)
+USED = Column("used", _FLAG, "", "whether the calibration uses this segment")
+
+# --- readings
+GYROSCOPE = _triad("gyroscope")
+ACCELEROMETER = _triad("accelerometer")
+MAGNETOMETER = _triad("magnetometer")
+MAGNETOMETER_AT_IMU = tuple(
+    Column(c.name, c.type, c.unit, c.meaning + ", interpolated to the IMU's time stamps", c.sensor)
+    for c in MAGNETOMETER
+)
+SMOOTHED = tuple(
+    column
+    for sensor in ("gyroscope", "accelerometer", "magnetometer")
+    for column in _triad(sensor, "smoothed_", "sensor axes, after the fixed-weight low-pass")
+)
+TEMPERATURE_DEGC = Column(
+    "temperature_degc",
+    _F64,
+    "degC",
+    "temperature of the IMU at that time; for a parameter its mean over the samples used",
+)
+
+# --- attitude and position
+QUATERNION = (
+    Column(
+        "qx",
+        _F64,
+        "1",
+        "first vector part of the unit quaternion, scalar last: body to world as logged, NED to body FRD in stages",
+    ),
+    Column("qy", _F64, "1", "second vector part of the unit quaternion"),
+    Column("qz", _F64, "1", "third vector part of the unit quaternion"),
+    Column("qw", _F64, "1", "scalar part of the unit quaternion"),
+)
+POSITION = tuple(
+    Column(
+        f"p{axis}_m", _F64, "m", f"{axis} coordinate of the body in the VPS's world frame; null where it is not logged"
+    )
+    for axis in "xyz"
+)
+LATITUDE_DEG = Column("latitude_deg", _F64, "deg", "geodetic latitude, WGS 84, north positive")
+LONGITUDE_DEG = Column("longitude_deg", _F64, "deg", "longitude, WGS 84, east positive")
+ALTITUDE_M = Column("altitude_m", _F64, "m", "altitude as the log has it (above the ellipsoid or mean sea level)")
+ATTITUDE_SD_RAD = Column(
+    "attitude_sd_rad",
+    _F64,
+    "rad",
+    "standard deviation of the attitude: root of the mean of the three rotation-vector variances, body axes",
+)
+TASTE = Column(
+    "taste",
+    _F64,
+    "1",
+    "fault test of the two-vector attitude, chi-square with 1 degree of freedom when the readings agree",
+)
+ACCELERATION_EXCESS_MPS2 = Column(
+    "acceleration_excess_mps2",
+    _F64,
+    "m/s^2",
+    "length of the calibrated accelerometer vector less gravity: motion that spoils the vertical",
+)
+BODY_RATE = tuple(
+    Column(
+        f"rate_{axis}_radps",
+        _F64,
+        "rad/s",
+        f"angular rate of the body about its {axis} axis (FRD) from the differentiated VPS attitude",
+    )
+    for axis in "xyz"
+)
+
+# --- covariance of a stage's parameters
+ROW = Column("row", _I32, "1", "row of the covariance: 0, 1, 2 scale x, y, z; 3, 4, 5 bias x, y, z")
+COLUMN = Column("column", _I32, "1", "column of the covariance, numbered as `row`")
+COVARIANCE_VALUE = Column("value", _F64, "product of the units of row and column", "covariance of the two parameters")
+
+# --- what leads every row of the history
+FLIGHT_ID = Column(
+    "flight_id",
+    _TEXT,
+    "",
+    "first 16 hex digits of the sha256 of the log's content: the same log is the same flight wherever it lies",
+)
+VEHICLE_ID = Column("vehicle_id", _TEXT, "", "vehicle that flew (`drift`: the latest one that carried the IMU)")
+IMU_ID = Column("imu_id", _TEXT, "", "inertial unit on board; the vehicle's id where no other is configured")
+SESSION_ID = Column("session_id", _TEXT, "", "field session of the flight: the folder the log lay in")
+STARTED_AT = Column(
+    "started_at",
+    pa.timestamp("us", tz="UTC"),
+    "",
+    "time of the first IMU sample, UTC; null when the log's clock has no known epoch",
+)
+LEAD = (FLIGHT_ID, VEHICLE_ID, IMU_ID, SESSION_ID, STARTED_AT)
+
+# --- flight
+LOG_URI = Column("log_uri", _TEXT, "", "path of the log relative to the archive")
+LOG_SHA256 = Column(
+    "log_sha256", _TEXT, "", "sha256 of the log's content (folder of CSVs: over its files' names and hashes)"
+)
+LOG_FORMAT = Column("log_format", _TEXT, "", "format of the log: mcap, csv, ulg, bin")
+DURATION_S = Column("duration_s", _F64, "s", "last less first IMU time stamp")
+IMU_RATE_HZ = Column("imu_rate_hz", _F64, "Hz", "median rate of the IMU samples")
+VPS_RATE_HZ = Column("vps_rate_hz", _F64, "Hz", "median rate of the VPS poses; null without VPS")
+N_SAMPLES = Column(
+    "n_samples", _I64, "1", "number of samples the row speaks of (`flight`: IMU samples kept; `fit`: samples compared)"
+)
+TEMPERATURE_MIN_DEGC = Column(
+    "temperature_min_degc", _F64, "degC", "lowest logged IMU temperature; null when not logged"
+)
+TEMPERATURE_MEAN_DEGC = Column(
+    "temperature_mean_degc", _F64, "degC", "mean logged IMU temperature; null when not logged"
+)
+TEMPERATURE_MAX_DEGC = Column(
+    "temperature_max_degc", _F64, "degC", "highest logged IMU temperature; null when not logged"
+)
+VERDICT = Column(
+    "verdict",
+    _TEXT,
+    "",
+    "ok: all read, no stage failed; partial: samples lost; quarantined: contradictory; rejected: nothing usable",
+)
+FINDINGS = Column("findings", _TEXT, "", "what was found in the log, JSON list of {code, count, sentence}")
+VERIFIABLE = Column("verifiable", _FLAG, "", "whether the log carries checksums that were checked")
+
+# --- why
+REASON_CODE = Column("reason_code", _TEXT, "", "short stable identifier of why it is not ok; null when it is")
+REASON = Column(
+    "reason", _TEXT, "", "why, as one sentence with the numbers that decided it; null when there is nothing to say"
+)
+
+# --- calibration
+SENSOR = Column("sensor", _TEXT, "", "magnetometer, accelerometer or gyroscope")
+METHOD = Column(
+    "method",
+    _TEXT,
+    "",
+    "estimator that made the row: ellipsoid, ellipsoid_robust, equation_error, output_error, joint, ...",
+)
+PARAMETER = Column(
+    "parameter",
+    _TEXT,
+    "",
+    "scale, bias: z = scale * logged + bias, sensor axes; zero = -bias/scale; zero_bias: z at the reference reading",
+)
+AXIS = Column("axis", _TEXT, "", "sensor axis x, y or z; full form xx, xy, ...")
+VALUE = Column("value", _F64, "named by column unit", "estimate of the parameter; null when refused without a number")
+SD = Column("sd", _F64, "named by column unit", "one standard deviation of the estimate (`drift`: of value_at_25degc)")
+UNIT = Column("unit", _TEXT, "", "unit of the numbers of the row that have none of their own")
+RUN_KEY = Column(
+    "run_key", _TEXT, "", "digest of inputs, parameters, code and versions that made the row", provenance=True
+)
+
+# --- fit
+QUANTITY = Column(
+    "quantity", _TEXT, "", "what is compared: attitude, quaternion_rate, attitude_propagated or body_rate"
+)
+REFERENCE = Column("reference", _TEXT, "", "what it is compared with: vps or quest")
+SIGNAL = Column("signal", _TEXT, "", "readings that were compared: raw or smoothed")
+SAMPLE = Column("sample", _TEXT, "", "samples that were compared: all, or held_out of the estimation")
+TIC = Column("tic", _F64, "1", "Theil inequality coefficient: 0 perfect, 1 no likeness")
+TIC_BIAS = Column("tic_bias", _F64, "1", "share of the squared error that is a difference of means")
+TIC_VARIANCE = Column("tic_variance", _F64, "1", "share of the squared error that is a difference of spread")
+TIC_COVARIANCE = Column("tic_covariance", _F64, "1", "share of the squared error that is lack of correlation")
+RMS = Column("rms", _F64, "named by column rms_unit", "rms of the difference; of the rotation angle for attitudes")
+RMS_UNIT = Column("rms_unit", _TEXT, "", "unit of rms: deg for attitudes, rad/s for rates, 1/s for quaternion rates")
+
+# --- sync
+LAG_S = Column(
+    "lag_s", _F64, "s", "VPS clock + lag = IMU clock, at the first IMU sample; contains the sensors' group delay"
+)
+LAG_MID_S = Column("lag_mid_s", _F64, "s", "the same in the middle of the flight")
+LAG_SD_S = Column("lag_sd_s", _F64, "s", "standard deviation of lag_mid_s")
+SKEW_PPM = Column(
+    "skew_ppm", _F64, "ppm", "drift of the VPS clock against the IMU's, positive when the VPS clock is fast"
+)
+SKEW_SD_PPM = Column("skew_sd_ppm", _F64, "ppm", "standard deviation of skew_ppm")
+PEAK = Column("peak", _F64, "1", "height of the correlation peak, 1 for equal signals")
+RUNNER_UP = Column("runner_up", _F64, "1", "height of the next best peak: close to `peak` means ambiguous")
+STATUS = Column(
+    "status",
+    _TEXT,
+    "",
+    "outcome: ok, refused, absent or failed (`drift`: stable, drifting, step, outlier, insufficient)",
+)
+
+# --- run
+STAGE = Column("stage", _TEXT, "", "stage of the pipeline")
+MEASURED = Column("measured", _TEXT, "", "what the stage measured about its input and result, JSON object")
+VERSIONS = Column(
+    "versions",
+    _TEXT,
+    "",
+    "versions of fieldcal, Python, numpy, scipy and polars that made the result, JSON object",
+    provenance=True,
+)
+
+# --- drift
+N_FLIGHTS = Column("n_flights", _I64, "1", "flights the regression used")
+VALUE_AT_25DEGC = Column("value_at_25degc", _F64, "named by column unit", "regressed value at 25 degC")
+SLOPE_PER_DEGC = Column("slope_per_degc", _F64, "column unit per degC", "change with temperature")
+SLOPE_PER_DEGC_SD = Column("slope_per_degc_sd", _F64, "column unit per degC", "standard deviation of slope_per_degc")
+SLOPE_PER_DAY = Column("slope_per_day", _F64, "column unit per day", "change with time")
+SLOPE_PER_DAY_SD = Column("slope_per_day_sd", _F64, "column unit per day", "standard deviation of slope_per_day")
+LAST_Z = Column("last_z", _F64, "1", "distance of the last flight from the regression, in standard deviations")
+CHANGE_AT = Column(
+    "change_at",
+    pa.timestamp("us", tz="UTC"),
+    "",
+    "start of the first flight after a detected step, UTC; null without one",
+)

@@ -1,0 +1,242 @@
+"""Every table: what a row is, its columns in order, the columns that identify a row."""
+
+from __future__ import annotations
+
+from schemas import columns as c
+from schemas.column import Column, Table
+
+_HISTORY_FLIGHT_KEY = ("flight_id",)
+
+_SIGNALS = (
+    Table(
+        "imu",
+        "signal",
+        1,
+        "inertial readings as logged; null columns where the log lacks a sensor",
+        (c.T_NS, *c.GYROSCOPE, *c.ACCELEROMETER),
+        ("t_ns",),
+    ),
+    Table("magnetometer", "signal", 1, "magnetometer readings as logged", (c.T_NS, *c.MAGNETOMETER), ("t_ns",)),
+    Table("temperature", "signal", 1, "IMU temperature as logged", (c.T_NS, c.TEMPERATURE_DEGC), ("t_ns",)),
+    Table(
+        "vps",
+        "signal",
+        1,
+        "poses of the visual positioning system as logged, on its own clock",
+        (c.T_NS, *c.QUATERNION, *c.POSITION),
+        ("t_ns",),
+    ),
+    Table(
+        "position",
+        "signal",
+        1,
+        "position from satellite navigation, for the local magnetic field",
+        (c.T_NS, c.LATITUDE_DEG, c.LONGITUDE_DEG, c.ALTITUDE_M),
+        ("t_ns",),
+    ),
+)
+
+_STAGES = (
+    Table(
+        "segments",
+        "stage",
+        1,
+        "excited stretches of the flight",
+        (c.SEGMENT, c.START_NS, c.END_NS, c.N_SAMPLES, c.RATE_RMS, c.USED, c.REASON),
+        ("segment",),
+    ),
+    Table(
+        "samples",
+        "stage",
+        1,
+        "readings of the used segments at the IMU's stamps, as logged and smoothed",
+        (c.T_NS, c.SEGMENT, *c.GYROSCOPE, *c.ACCELEROMETER, *c.MAGNETOMETER_AT_IMU, *c.SMOOTHED),
+        ("t_ns",),
+    ),
+    Table(
+        "attitude",
+        "stage",
+        1,
+        "attitude from the two vectors",
+        (c.T_NS, c.SEGMENT, *c.QUATERNION, c.ATTITUDE_SD_RAD, c.TASTE, c.ACCELERATION_EXCESS_MPS2),
+        ("t_ns",),
+    ),
+    Table(
+        "covariance",
+        "stage",
+        1,
+        "covariance of scale and bias",
+        (c.ROW, c.COLUMN, c.COVARIANCE_VALUE),
+        ("row", "column"),
+    ),
+    Table(
+        "vps_aligned",
+        "stage",
+        1,
+        "VPS attitude and body rate on the IMU's clock and axes",
+        (c.T_NS, *c.QUATERNION, *c.BODY_RATE),
+        ("t_ns",),
+    ),
+)
+
+_HISTORY = (
+    Table(
+        "flight",
+        "history",
+        1,
+        "one row a log, with its verdict",
+        (
+            *c.LEAD,
+            c.LOG_URI,
+            c.LOG_SHA256,
+            c.LOG_FORMAT,
+            c.DURATION_S,
+            c.IMU_RATE_HZ,
+            c.VPS_RATE_HZ,
+            c.N_SAMPLES,
+            c.TEMPERATURE_MIN_DEGC,
+            c.TEMPERATURE_MEAN_DEGC,
+            c.TEMPERATURE_MAX_DEGC,
+            c.VERDICT,
+            c.REASON_CODE,
+            c.REASON,
+            c.FINDINGS,
+            c.VERIFIABLE,
+        ),
+        _HISTORY_FLIGHT_KEY,
+    ),
+    Table(
+        "calibration",
+        "history",
+        1,
+        "one row a sensor, method, parameter and axis of a flight",
+        (
+            *c.LEAD,
+            c.SENSOR,
+            c.METHOD,
+            c.PARAMETER,
+            c.AXIS,
+            c.VALUE,
+            c.SD,
+            c.UNIT,
+            c.TEMPERATURE_DEGC,
+            c.STATUS,
+            c.REASON_CODE,
+            c.RUN_KEY,
+        ),
+        ("flight_id", "sensor", "method", "parameter", "axis"),
+    ),
+    Table(
+        "fit",
+        "history",
+        1,
+        "one row a quantity, method and reference of a flight: how well they agree",
+        (
+            *c.LEAD,
+            c.QUANTITY,
+            c.METHOD,
+            c.REFERENCE,
+            c.SIGNAL,
+            c.SAMPLE,
+            c.TIC,
+            c.TIC_BIAS,
+            c.TIC_VARIANCE,
+            c.TIC_COVARIANCE,
+            c.RMS,
+            c.RMS_UNIT,
+            c.N_SAMPLES,
+            c.RUN_KEY,
+        ),
+        ("flight_id", "quantity", "method", "reference", "signal", "sample"),
+    ),
+    Table(
+        "sync",
+        "history",
+        1,
+        "one row a flight with VPS: its clock against the IMU's",
+        (
+            *c.LEAD,
+            c.LAG_S,
+            c.LAG_MID_S,
+            c.LAG_SD_S,
+            c.SKEW_PPM,
+            c.SKEW_SD_PPM,
+            c.PEAK,
+            c.RUNNER_UP,
+            c.STATUS,
+            c.RUN_KEY,
+        ),
+        _HISTORY_FLIGHT_KEY,
+    ),
+    Table(
+        "run",
+        "history",
+        1,
+        "one row a stage of a flight: the execution that made the result",
+        (*c.LEAD, c.STAGE, c.STATUS, c.REASON_CODE, c.MEASURED, c.RUN_KEY, c.VERSIONS),
+        ("flight_id", "stage"),
+    ),
+    Table(
+        "drift",
+        "history",
+        1,
+        "one row an IMU, sensor, method, parameter and axis: trend over temperature and time",
+        (
+            c.VEHICLE_ID,
+            c.IMU_ID,
+            c.SENSOR,
+            c.METHOD,
+            c.PARAMETER,
+            c.AXIS,
+            c.UNIT,
+            c.N_FLIGHTS,
+            c.VALUE_AT_25DEGC,
+            c.SD,
+            c.SLOPE_PER_DEGC,
+            c.SLOPE_PER_DEGC_SD,
+            c.SLOPE_PER_DAY,
+            c.SLOPE_PER_DAY_SD,
+            c.LAST_Z,
+            c.CHANGE_AT,
+            c.STATUS,
+        ),
+        ("imu_id", "sensor", "method", "parameter", "axis"),
+    ),
+)
+
+TABLES: dict[str, Table] = {table.name: table for table in (*_SIGNALS, *_STAGES, *_HISTORY)}
+SIGNAL_TABLES = tuple(table.name for table in _SIGNALS)
+STAGE_TABLES = tuple(table.name for table in _STAGES)
+HISTORY_TABLES = tuple(table.name for table in _HISTORY)
+
+_NOT_AT_STAGE_LEVEL = frozenset(column.name for column in (*c.LEAD, c.RUN_KEY))
+_AT_STAGE_LEVEL = ("calibration", "fit", "sync")
+
+
+def table_columns(table: str, *, stage: bool = False) -> tuple[Column, ...]:
+    """Columns of a table; with `stage` those a stage writes: the lead and the run key are added when it is published.
+
+    Raises
+    ------
+    KeyError
+        There is no such table, or (`stage`) no stage writes it.
+    """
+    if table not in TABLES:
+        raise KeyError(f"there is no table {table!r}; there are {', '.join(TABLES)}")
+    definition = TABLES[table]
+    if not stage or definition.kind == "stage":
+        return definition.columns
+    if table not in _AT_STAGE_LEVEL:
+        raise KeyError(f"no stage writes the table {table!r}")
+    return tuple(column for column in definition.columns if column.name not in _NOT_AT_STAGE_LEVEL)
+
+
+def table_key(table: str, *, stage: bool = False) -> tuple[str, ...]:
+    """Columns that identify a row of `table`."""
+    names = {column.name for column in table_columns(table, stage=stage)}
+    return tuple(name for name in TABLES[table].key if name in names)
+
+
+def stage_columns(table: str) -> tuple[str, ...]:
+    """Names of the columns of `table` as a stage writes it."""
+    return tuple(column.name for column in table_columns(table, stage=True))
