@@ -1,0 +1,109 @@
+"""Which logs an archive holds, and the identity of a log's content."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from fieldcal.logs.interface import LogFile
+
+LOG_FORMATS = {".mcap": "mcap", ".csv": "csv", ".ulg": "ulog", ".bin": "dataflash"}
+FOLDER_FORMAT = "csv"
+_READ_BYTES = 1 << 20
+
+
+def log_format(path: Path) -> str | None:
+    """The format that a path's name promises (a folder with `imu.csv` counts as csv), or None when it is no log."""
+    if path.is_dir():
+        return FOLDER_FORMAT if (path / "imu.csv").is_file() else None
+    return LOG_FORMATS.get(path.suffix.lower())
+
+
+def log_sha256(path: Path) -> str:
+    """sha256 of a log's content, in hexadecimal.
+
+    A file: of its bytes. A folder: of one line "name NUL sha256" for each of its CSV files, sorted by name.
+    """
+    if not path.is_dir():
+        return _file_sha256(path)
+    digest = hashlib.sha256()
+    for part in sorted(folder_parts(path), key=lambda part: part.name):
+        digest.update(os.fsencode(part.name) + b"\0" + _file_sha256(part).encode() + b"\n")
+    return digest.hexdigest()
+
+
+def folder_parts(folder: Path) -> list[Path]:
+    """The CSV files of a log folder."""
+    return [part for part in folder.iterdir() if part.suffix.lower() == ".csv" and part.is_file()]
+
+
+def flight_id(sha: str) -> str:
+    """The flight a content hash names: its first 16 hexadecimal digits."""
+    return sha[:16]
+
+
+def find_logs(archive: Path, logs_map: Iterable[Mapping[str, Any]] | None = None) -> list[LogFile]:
+    """All logs of an archive, sorted by their place in it.
+
+    Parameters
+    ----------
+    archive : Path
+        Root of the archive: `ARCHIVE/<vehicle_id>/<session_id>/<log>`.
+    logs_map : iterable of mappings, optional
+        `{"glob": ..., "vehicle": ..., "session": ...}` for archives of another shape, relative to the root. A log
+        matched here takes vehicle and session from the first entry that matches.
+
+    Notes
+    -----
+    Hidden names are skipped. Links are followed only while they stay inside the archive.
+    """
+    root = archive.resolve()
+    found: dict[str, LogFile] = {}
+    for entry in logs_map or ():
+        for path in sorted(archive.glob(str(entry["glob"]))):
+            _add(found, archive, root, path, str(entry["vehicle"]), str(entry["session"]))
+    for vehicle in _folders(archive, root):
+        for session in _folders(vehicle, root):
+            if log_format(session) is not None and session.relative_to(archive).as_posix() in found:
+                continue
+            for path in _entries(session):
+                _add(found, archive, root, path, vehicle.name, session.name)
+    return sorted(found.values(), key=lambda log: log.log_uri)
+
+
+def _add(found: dict[str, LogFile], archive: Path, root: Path, path: Path, vehicle: str, session: str) -> None:
+    if not _inside(path, root):
+        return
+    kind = log_format(path)
+    log_uri = path.relative_to(archive).as_posix()
+    if kind is not None and log_uri not in found:
+        found[log_uri] = LogFile(path, log_uri, vehicle, session, kind)
+
+
+def _folders(folder: Path, root: Path) -> Iterator[Path]:
+    return (path for path in _entries(folder) if _inside(path, root) and path.is_dir())
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    except OSError:
+        return []
+
+
+def _inside(path: Path, root: Path) -> bool:
+    try:
+        return path.resolve(strict=True).is_relative_to(root)
+    except (OSError, RuntimeError):
+        return False
+
+
+def _file_sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while piece := stream.read(_READ_BYTES):
+            digest.update(piece)
+    return digest.hexdigest()

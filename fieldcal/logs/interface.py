@@ -1,0 +1,139 @@
+"""What every log reader hands over: signal batches, and a summary of what the log says of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Columns = dict[str, NDArray[Any]]
+Batch = tuple[str, Columns]
+
+SENSORS = ("gyroscope", "accelerometer", "magnetometer")
+UNKNOWN_UNIT = "unknown"
+
+SIGNAL_COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "imu": (
+        "t_ns",
+        "gyroscope_x",
+        "gyroscope_y",
+        "gyroscope_z",
+        "accelerometer_x",
+        "accelerometer_y",
+        "accelerometer_z",
+    ),
+    "magnetometer": ("t_ns", "magnetometer_x", "magnetometer_y", "magnetometer_z"),
+    "temperature": ("t_ns", "temperature_degc"),
+    "vps": ("t_ns", "qx", "qy", "qz", "qw", "px_m", "py_m", "pz_m"),
+    "position": ("t_ns", "latitude_deg", "longitude_deg", "altitude_m"),
+}
+
+EPOCH_KNOWN_AFTER_NS = 1_000_000_000 * 1_000_000_000
+"""Stamps beyond 2001-09-09 are taken for Unix time, smaller ones for a clock with an unknown zero."""
+
+
+class VehicleLike(Protocol):
+    """The part of a configured vehicle that reading a log needs (`fieldcal.configuration.Vehicle`)."""
+
+    @property
+    def units(self) -> Mapping[str, str]: ...
+    @property
+    def csv(self) -> Any: ...
+    @property
+    def mcap(self) -> Any: ...
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing worth knowing about a log.
+
+    `loses_data`: samples of the original recording are missing from what was delivered.
+    `fatal`: the log contradicts itself; nothing of it should be published.
+    """
+
+    code: str
+    count: int
+    sentence: str
+    loses_data: bool = False
+    fatal: bool = False
+
+
+@dataclass
+class LogSummary:
+    """What a log says of itself. Complete once the reader's `batches()` is exhausted.
+
+    `units`: sensor -> unit of the delivered numbers, "unknown" when neither log nor configuration says.
+    `world`, `body`, `gravity_sign`: the log's own declaration, None when it makes none.
+    `epoch_known`: stamps are Unix time. `verifiable`: every delivered sample was under a checksum that held.
+    `counts`: signal table -> delivered rows. `metadata`: text pairs found in the log.
+    """
+
+    log_format: str
+    units: dict[str, str] = field(default_factory=lambda: dict.fromkeys(SENSORS, UNKNOWN_UNIT))
+    world: str | None = None
+    body: str | None = None
+    gravity_sign: str | None = None
+    epoch_known: bool = False
+    verifiable: bool = False
+    findings: list[Finding] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
+    metadata: dict[str, str] = field(default_factory=dict)
+
+    def add(self, code: str, count: int, sentence: str, *, loses_data: bool = False, fatal: bool = False) -> None:
+        """Record one finding."""
+        self.findings.append(Finding(code, count, sentence, loses_data, fatal))
+
+    def count_rows(self, table: str, columns: Columns) -> None:
+        """Account for a delivered batch."""
+        self.counts[table] = self.counts.get(table, 0) + len(columns["t_ns"])
+
+
+class LogReader(Protocol):
+    """A log being read. `batches()` yields (signal table, columns) in file order and may be called once.
+
+    Columns are named as in the signal tables: `t_ns` int64, the rest float64. Columns that the log does not have (a
+    gyroscope in an accelerometer log, the position of an attitude-only VPS) are absent from the mapping;
+    `fieldcal.logs.batch_frame` adds them as nulls.
+    """
+
+    summary: LogSummary
+
+    def batches(self) -> Iterator[Batch]: ...
+
+
+@dataclass(frozen=True)
+class LogFile:
+    """A log found in an archive. `log_uri` is relative to the archive, with forward slashes."""
+
+    path: Path
+    log_uri: str
+    vehicle_id: str
+    session_id: str
+    log_format: str
+
+
+def stamps_are_epoch(t_ns: NDArray[np.int64]) -> bool:
+    """Whether stamps (nanoseconds) look like Unix time rather than time since some start."""
+    return bool(t_ns.size) and int(np.median(t_ns)) > EPOCH_KNOWN_AFTER_NS
+
+
+def logged_units(
+    summary: LogSummary, declared: Mapping[str, str], configured: Mapping[str, str], log_name: str
+) -> dict[str, str]:
+    """Unit per sensor: the configured one, else the log's own, else "unknown". A contradiction is a finding."""
+    units = {}
+    for sensor in SENSORS:
+        own, wanted = declared.get(sensor), configured.get(sensor)
+        if own and wanted and own != wanted:
+            summary.add(
+                "unit_conflict",
+                1,
+                f"{log_name}: the log gives its {sensor} in {own}, the configuration says {wanted}; the configuration "
+                f"is followed. Correct units.{sensor} if the log is right.",
+            )
+        units[sensor] = wanted or own or UNKNOWN_UNIT
+    return units
