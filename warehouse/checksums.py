@@ -1,0 +1,52 @@
+"""The recorded sha256 of every file that is kept.
+
+The record is written before the file gets its final name and holds the sha256 of the new content and of what was there
+until then (None: nothing): after a crash between the two, either is what it should be.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from warehouse.errors import disk
+from warehouse.files import file_sha256, write_bytes
+from warehouse.layout import checksum_path
+from warehouse.sealed import BrokenSeal, seal, unseal
+
+
+def record(root: Path, path: Path, sha256: str) -> None:
+    """Record that `path` is about to hold content with this sha256."""
+    before = file_sha256(path) if path.exists() else None
+    write_bytes(checksum_path(root, path), seal({"sha256": [sha256, before]}))
+
+
+def recorded(root: Path, path: Path) -> list[str | None] | None:
+    """What `path` may hold (None in the list: it may be absent); None when nothing is recorded.
+
+    Raises
+    ------
+    BrokenSeal
+        The record itself is damaged.
+    """
+    beside = checksum_path(root, path)
+    if not beside.exists():
+        return None
+    with disk(beside, "read"):
+        data = beside.read_bytes()
+    found = unseal(data).get("sha256")
+    if not isinstance(found, list):
+        raise BrokenSeal("it lists no sha256")
+    return found
+
+
+def problem(root: Path, path: Path, sha256: str | None) -> str | None:
+    """What is wrong with `path`, whose content has this sha256 (None: it is absent); None when nothing is."""
+    try:
+        allowed = recorded(root, path)
+    except BrokenSeal as error:
+        return f"its recorded sha256 is damaged: {error}"
+    if allowed is None:
+        return "no sha256 is recorded for it"
+    if sha256 in allowed:
+        return None
+    return "it is missing" if sha256 is None else "its content is not what was written: the sha256 differs"

@@ -1,0 +1,71 @@
+"""What `tables/` say, as one hash: independent of row order, file layout, compression and of how results came to be."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+import schemas
+from warehouse.layout import history_files
+from warehouse.store import read_table
+
+_JSON_COLUMNS = ("measured", "findings")
+
+
+def content_sha256(root: Path) -> str:
+    """sha256 over all history tables; equal for equal results.
+
+    Left out are the columns that say how a result was made (`run_key`, `versions`). JSON counts by its content, not
+    by its spelling.
+    """
+    digest = hashlib.sha256()
+    for table in sorted(schemas.HISTORY_TABLES):
+        folders: dict[Path, list[Path]] = {}
+        for path in history_files(root, table):
+            folders.setdefault(path.parent, []).append(path)
+        for folder in sorted(folders):
+            rows = pl.concat([read_table(path, table) for path in folders[folder]])
+            if rows.height:
+                digest.update(f"{table}\0{folder.name}\0{rows.height}\0".encode())
+                digest.update(rows_sha256(rows, table))
+    return digest.hexdigest()
+
+
+def rows_sha256(rows: pl.DataFrame, table: str) -> bytes:
+    """Digest of a table's rows as a set."""
+    columns = [column.name for column in schemas.table_columns(table) if not column.provenance]
+    texts = [name for name in columns if name in _JSON_COLUMNS]
+    shown = rows.select(columns).with_columns(
+        pl.col(pl.Float64).fill_nan(None) + 0.0,
+        *(pl.col(name).map_elements(_canonical_json, return_dtype=pl.String) for name in texts),
+    )
+    ordered = shown.sort(columns, nulls_last=False)
+    digest = hashlib.sha256()
+    for name in columns:
+        digest.update(name.encode())
+        _update(digest, ordered[name])
+    return digest.digest()
+
+
+def _update(digest: Any, column: pl.Series) -> None:
+    digest.update(column.is_null().to_numpy().tobytes())
+    if column.dtype == pl.String:
+        texts = [text.encode() for text in column.fill_null("")]
+        digest.update(np.array([len(text) for text in texts], dtype="<i8").tobytes())
+        digest.update(b"".join(texts))
+    elif column.dtype == pl.Float64:
+        digest.update(column.fill_null(0.0).to_numpy().astype("<f8").tobytes())
+    else:
+        digest.update(column.cast(pl.Int64).fill_null(0).to_numpy().astype("<i8").tobytes())
+
+
+def _canonical_json(text: str) -> str:
+    try:
+        return json.dumps(json.loads(text), sort_keys=True, ensure_ascii=False)
+    except ValueError:
+        return text

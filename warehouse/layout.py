@@ -1,0 +1,123 @@
+"""Where things lie below the data root, and how ids become names of files that cannot leave it.
+
+An id (of a vehicle, a flight, a stage) may be any text. In a path every byte outside `A-Z a-z 0-9 . _ -` is
+percent-encoded, and so is a leading dot or underscore (engines skip such files). The empty id has Hive's name for it.
+A name beyond 150 bytes is cut and ends in `~` and a digest; the exact id is then in the table's column only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import string
+from pathlib import Path
+
+from schemas import HISTORY_TABLES, SIGNAL_TABLES
+from warehouse.errors import disk
+
+_PLAIN = frozenset(f"{string.ascii_letters}{string.digits}._-".encode())
+_EMPTY = "__HIVE_DEFAULT_PARTITION__"
+_LONGEST = 150
+_CUT = 100
+_PARTITION = "vehicle_id="
+
+
+def encode_id(text: str) -> str:
+    """Name of a file or folder for an id: one path component, never `.` or `..`, at most 150 bytes."""
+    raw = text.encode("utf-8", "surrogatepass")
+    if not raw:
+        return _EMPTY
+    parts = [chr(byte) if byte in _PLAIN else f"%{byte:02X}" for byte in raw]
+    if raw[:1] in (b".", b"_"):
+        parts[0] = f"%{raw[0]:02X}"
+    name = "".join(parts)
+    if len(name) <= _LONGEST:
+        return name
+    kept = ""
+    for part in parts:
+        if len(kept) + len(part) > _CUT:
+            break
+        kept += part
+    return f"{kept}~{hashlib.sha256(raw).hexdigest()[:32]}"
+
+
+def decode_id(name: str) -> str | None:
+    """The id that `encode_id` turned into `name`; None when the name is a shortened one."""
+    if name == _EMPTY:
+        return ""
+    if "~" in name:
+        return None
+    raw = bytearray()
+    position = 0
+    while position < len(name):
+        if name[position] == "%":
+            raw += bytes.fromhex(name[position + 1 : position + 3])
+            position += 3
+        else:
+            raw += name[position].encode()
+            position += 1
+    return raw.decode("utf-8", "surrogatepass")
+
+
+def signal_path(root: Path, table: str, vehicle_id: str, flight_id: str) -> Path:
+    """File of one flight's readings."""
+    _known(table, SIGNAL_TABLES)
+    return root / "signals" / table / f"{_PARTITION}{encode_id(vehicle_id)}" / f"{encode_id(flight_id)}.parquet"
+
+
+def history_path(root: Path, table: str, vehicle_id: str) -> Path:
+    """File of one vehicle's history."""
+    _known(table, HISTORY_TABLES)
+    return root / "tables" / table / f"{_PARTITION}{encode_id(vehicle_id)}" / "part.parquet"
+
+
+def stage_folder(root: Path, stage: str, flight_id: str, run_key: str) -> Path:
+    """Folder of one execution of one stage."""
+    return root / "stages" / encode_id(stage) / encode_id(flight_id) / encode_id(run_key)
+
+
+def history_files(root: Path, table: str) -> list[Path]:
+    """Files of a history table, one a vehicle, in a fixed order."""
+    _known(table, HISTORY_TABLES)
+    return sorted((root / "tables" / table).glob(f"{_PARTITION}*/*.parquet"))
+
+
+def signal_files(root: Path, table: str) -> list[Path]:
+    """Files of a signal table, one a flight, in a fixed order."""
+    _known(table, SIGNAL_TABLES)
+    return sorted((root / "signals" / table).glob(f"{_PARTITION}*/*.parquet"))
+
+
+def vehicle_of(path: Path) -> str | None:
+    """Vehicle whose folder `path` lies in; None where the name is shortened."""
+    return decode_id(path.parent.name.removeprefix(_PARTITION))
+
+
+def checksum_path(root: Path, path: Path) -> Path:
+    """Where the recorded sha256 of `path` (below `root`) is kept: a tree of its own, so data folders hold data only."""
+    return root / "checksums" / path.relative_to(root).with_name(path.name + ".json")
+
+
+def lock_path(root: Path, vehicle_id: str) -> Path:
+    """Lock that guards the publishing of a vehicle."""
+    return root / f".lock-{encode_id(vehicle_id)}"
+
+
+def prepare(root: Path) -> None:
+    """Make the data root: ignored by git, its cache of stages readable by its owner only."""
+    with disk(root, "prepared"):
+        if not root.is_dir():
+            root.mkdir(parents=True, exist_ok=True)
+        ignore = root / ".gitignore"
+        if not ignore.exists():
+            ignore.write_text("*\n", encoding="ascii")
+        stages = root / "stages"
+        if not stages.is_dir():
+            stages.mkdir(mode=0o700, exist_ok=True)
+        if stages.stat().st_mode & 0o077:
+            os.chmod(stages, 0o700)
+
+
+def _known(table: str, tables: tuple[str, ...]) -> None:
+    if table not in tables:
+        raise ValueError(f"there is no table {table!r} here; there are {', '.join(tables)}")

@@ -1,0 +1,126 @@
+"""Publish into the history: one file a vehicle and table, replaced whole, atomically, and only when it changes."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Mapping
+from functools import partial
+from pathlib import Path
+
+import polars as pl
+
+import schemas
+from schemas import HISTORY_TABLES, SchemaMismatch
+from warehouse import checksums
+from warehouse.errors import WarehouseError, disk
+from warehouse.files import write_bytes
+from warehouse.layout import checksum_path, history_path
+from warehouse.lock import vehicle_lock
+from warehouse.store import conform, empty_frame, frame, read_arrow, read_table, table_bytes
+
+_ORDER = (*(name for name in HISTORY_TABLES if name != "flight"), "flight")
+
+
+def publish(
+    root: Path,
+    vehicle_id: str,
+    rows: Mapping[str, pl.DataFrame],
+    flights: Collection[str],
+    *,
+    timeout_s: float = 300.0,
+) -> tuple[str, ...]:
+    """Replace all rows of `flights` in the vehicle's history by `rows`; rows of other flights stay.
+
+    A table that is not in `rows` loses its rows of these flights too. `drift` has no flights: when given, it replaces
+    the vehicle's. `flight` is written last: a flight that it lists as just published is so in every other table.
+
+    Parameters
+    ----------
+    rows : mapping
+        History tables with all their columns, lead included; NaN becomes null.
+    flights : collection
+        Flight ids replaced; every row given belongs to one of them.
+    timeout_s : float
+        How long to wait for another process that publishes this vehicle.
+
+    Returns
+    -------
+    tuple
+        The tables whose file changed.
+
+    Raises
+    ------
+    WarehouseError
+        `damaged_file` (what is there cannot be trusted: nothing is overwritten), `busy`, or the disk's refusal.
+    SchemaMismatch
+        Rows are not of their table, of another vehicle or flight, or two have the same key.
+    """
+    prepared = {table: _prepared(table, new, vehicle_id, frozenset(flights)) for table, new in rows.items()}
+    changed = []
+    with vehicle_lock(root, vehicle_id, timeout_s):
+        for table in _ORDER:
+            new = prepared.get(table)
+            if (table == "drift" and new is None) or (new is None and not flights):
+                continue
+            if _replace(root, table, vehicle_id, empty_frame(table) if new is None else new, flights):
+                changed.append(table)
+    return tuple(changed)
+
+
+def read_history(root: Path, table: str, vehicle_id: str) -> pl.DataFrame:
+    """A vehicle's history as it is; no rows when there is none."""
+    path = history_path(root, table, vehicle_id)
+    return read_table(path, table) if path.exists() else empty_frame(table)
+
+
+def _prepared(table: str, rows: pl.DataFrame, vehicle_id: str, flights: frozenset[str]) -> pl.DataFrame:
+    if table not in HISTORY_TABLES:
+        raise SchemaMismatch(f"{table} is no table of the history; those are {', '.join(HISTORY_TABLES)}")
+    result = frame(conform(rows, table, schemas.arrow_schema(table)))
+    _only(table, "vehicle", result["vehicle_id"], {vehicle_id})
+    if table != "drift":
+        _only(table, "flight", result["flight_id"], flights)
+    return result.with_columns(pl.col(pl.Float64).fill_nan(None))
+
+
+def _only(table: str, what: str, found: pl.Series, allowed: Collection[str]) -> None:
+    if others := set(found.to_list()) - set(allowed):
+        raise SchemaMismatch(f"{table}: rows of {what} {min(map(str, others))!r} are not of what is published here")
+
+
+def _replace(root: Path, table: str, vehicle_id: str, new: pl.DataFrame, flights: Collection[str]) -> bool:
+    path = history_path(root, table, vehicle_id)
+    before, there = _existing(root, path, table)
+    kept = there.clear() if table == "drift" else there.filter(~pl.col("flight_id").is_in(list(flights)))
+    if before is None and not new.height:
+        return False
+    after = table_bytes(_sorted(table, pl.concat([kept, new])), table)
+    if after == before:
+        return False
+    write_bytes(path, after, partial(checksums.record, root, path))
+    return True
+
+
+def _existing(root: Path, path: Path, table: str) -> tuple[bytes | None, pl.DataFrame]:
+    """Bytes and rows of what is there, refused when it is not what was written."""
+    if not path.exists():
+        return None, empty_frame(table)
+    with disk(path, "read"):
+        data = path.read_bytes()
+    if problem := checksums.problem(root, path, hashlib.sha256(data).hexdigest()):
+        raise WarehouseError(
+            "damaged_file",
+            f"{path} is damaged ({problem}), and nothing is published over it. Restore it, or remove it and "
+            f"{checksum_path(root, path)} and run the night again: the flights are calibrated anew.",
+        )
+    return data, frame(read_arrow(data, table, name=str(path)))
+
+
+def _sorted(table: str, rows: pl.DataFrame) -> pl.DataFrame:
+    """Rows in the order of flights in time, then of their key, which must be theirs alone."""
+    key = list(schemas.table_key(table))
+    if (double := rows.select(key).is_duplicated()).any():
+        first = rows.filter(double).select(key).row(0)
+        raise SchemaMismatch(f"{table}: more than one row with {', '.join(key)} = {', '.join(map(str, first))}")
+    order = key if table == "drift" else ["started_at", *key]
+    return rows.sort(order, nulls_last=False)

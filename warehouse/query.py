@@ -1,0 +1,92 @@
+"""Ask the warehouse: lazily in polars, or in SQL that can only read."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES
+from warehouse.layout import encode_id, history_files, history_path, signal_files, signal_path
+from warehouse.signals import signal_ids
+from warehouse.sql import run_sql
+from warehouse.store import empty_frame
+
+DEFAULT_ROOT = "fieldcal-data"
+
+
+class Warehouse:
+    """The data below a root.
+
+    Parameters
+    ----------
+    root : Path or str, optional
+        Data root; else `FIELDCAL_WAREHOUSE`, else `./fieldcal-data`.
+    """
+
+    def __init__(self, root: Path | str | None = None) -> None:
+        self.root = Path(root or os.environ.get("FIELDCAL_WAREHOUSE") or DEFAULT_ROOT)
+
+    def scan(self, table: str, *, vehicle_id: str | None = None, flight_id: str | None = None) -> pl.LazyFrame:
+        """A table as a lazy frame; typed and empty when there is nothing yet.
+
+        Signals come with `vehicle_id` and `flight_id` in front; name a flight unless all of them are meant.
+        `vehicle_id` and `flight_id` narrow what is read.
+
+        Raises
+        ------
+        ValueError
+            There is no such table.
+        """
+        if table in SIGNAL_TABLES:
+            return self._signals(table, vehicle_id, flight_id)
+        if table not in HISTORY_TABLES:
+            raise ValueError(
+                f"there is no table {table!r} to ask; there are {', '.join(HISTORY_TABLES + SIGNAL_TABLES)}"
+            )
+        if vehicle_id is None:
+            files = history_files(self.root, table)
+        else:
+            files = [path for path in [history_path(self.root, table, vehicle_id)] if path.exists()]
+        frame = _scan(files, table)
+        return frame if flight_id is None else frame.filter(pl.col("flight_id") == flight_id)
+
+    def sql(self, query: str, parameters: Sequence[Any] | None = None, **limits: Any) -> pl.DataFrame:
+        """Answer one SELECT over the history tables and views; limits as in `warehouse.sql.run_sql`.
+
+        Raises
+        ------
+        WarehouseError
+            `sql_refused`, `sql_wrong`, `sql_timeout`, `sql_too_large`.
+        """
+        return run_sql(self.root, query, parameters, **limits)
+
+    def _signals(self, table: str, vehicle_id: str | None, flight_id: str | None) -> pl.LazyFrame:
+        if vehicle_id is not None and flight_id is not None:
+            files = [path for path in [signal_path(self.root, table, vehicle_id, flight_id)] if path.exists()]
+        else:
+            files = signal_files(self.root, table)
+        if vehicle_id is not None:
+            files = [path for path in files if path.parent.name == f"vehicle_id={encode_id(vehicle_id)}"]
+        if flight_id is not None:
+            files = [path for path in files if path.stem == encode_id(flight_id)]
+        return pl.concat([_with_ids(path, table) for path in files] or [_ids(empty_frame(table).lazy(), "", "")])
+
+
+def _scan(files: Sequence[Path], table: str) -> pl.LazyFrame:
+    if not files:
+        return empty_frame(table).lazy()
+    columns = list(TABLES[table].column_names)
+    return pl.scan_parquet(list(files), hive_partitioning=False, glob=False).select(columns)
+
+
+def _with_ids(path: Path, table: str) -> pl.LazyFrame:
+    vehicle_id, flight_id = signal_ids(path)
+    return _ids(_scan([path], table), vehicle_id, flight_id)
+
+
+def _ids(frame: pl.LazyFrame, vehicle_id: str, flight_id: str) -> pl.LazyFrame:
+    return frame.select(pl.lit(flight_id).alias("flight_id"), pl.lit(vehicle_id).alias("vehicle_id"), pl.all())

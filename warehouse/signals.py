@@ -1,0 +1,43 @@
+"""Readings as logged: one file a flight and table, written once at ingest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import polars as pl
+
+from warehouse import checksums
+from warehouse.layout import decode_id, prepare, signal_path, vehicle_of
+from warehouse.store import TableWriter, read_facts, read_table
+
+
+def signal_writer(
+    root: Path,
+    table: str,
+    vehicle_id: str,
+    flight_id: str,
+    *,
+    units: Mapping[str, str] | None = None,
+    metadata: Mapping[str, str] | None = None,
+) -> TableWriter:
+    """Writer of one signal of one flight; its sha256 is recorded, the exact ids are in the file's metadata."""
+    prepare(root)
+    path = signal_path(root, table, vehicle_id, flight_id)
+    facts = {**(metadata or {}), "fieldcal.vehicle_id": vehicle_id, "fieldcal.flight_id": flight_id}
+    return TableWriter(table, path, units=units, metadata=facts, before_rename=partial(checksums.record, root, path))
+
+
+def read_signal(root: Path, table: str, vehicle_id: str, flight_id: str) -> pl.DataFrame:
+    """Readings of one flight."""
+    return read_table(signal_path(root, table, vehicle_id, flight_id), table)
+
+
+def signal_ids(path: Path) -> tuple[str, str]:
+    """Vehicle and flight of a signal file: from its name, or from its metadata where the name is shortened."""
+    vehicle_id, flight_id = vehicle_of(path), decode_id(path.stem)
+    if vehicle_id is None or flight_id is None:
+        facts = read_facts(path)
+        return facts["fieldcal.vehicle_id"], facts["fieldcal.flight_id"]
+    return vehicle_id, flight_id

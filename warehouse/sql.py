@@ -1,0 +1,142 @@
+"""One SELECT over the history in DuckDB, locked down: no files, no network, no settings, bounded in memory and time.
+
+The engine never opens a file: it reads Arrow datasets that are made here and handed over, and only then is everything
+external switched off and the configuration locked.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import polars as pl
+import pyarrow as pa
+import pyarrow.dataset
+
+import schemas
+from schemas import HISTORY_TABLES
+from warehouse.errors import WarehouseError
+from warehouse.layout import history_files, vehicle_of
+from warehouse.store import frame
+
+VIEWS = ("latest_calibration", "history", "drift_by_temperature", "worst_tic", "refusals", "calibration_at")
+
+_READING = frozenset({"SELECT", "EXPLAIN"})
+_ROWS_PER_BATCH = 65_536
+_CONFIG: dict[str, str | bool | int | float | list[str]] = {
+    "autoinstall_known_extensions": False,
+    "autoload_known_extensions": False,
+    "allow_community_extensions": False,
+    "python_enable_replacements": False,
+    "temp_directory": "",
+}
+
+
+def run_sql(
+    root: Path,
+    query: str,
+    parameters: Sequence[Any] | None = None,
+    *,
+    timeout_s: float = 60.0,
+    memory_mb: int = 1024,
+    max_result_mb: int = 512,
+) -> pl.DataFrame:
+    """Answer one reading statement; `parameters` fill its `?` marks.
+
+    Parameters
+    ----------
+    timeout_s : float
+        The query is interrupted after this time.
+    memory_mb, max_result_mb : int
+        Memory the engine may use, and size the result may have.
+
+    Raises
+    ------
+    WarehouseError
+        `sql_refused` (not one SELECT, or it reaches outside), `sql_wrong` (syntax, unknown names, wrong types),
+        `sql_timeout`, `sql_too_large`.
+    """
+    with duckdb.connect(":memory:", config={**_CONFIG, "memory_limit": f"{memory_mb}MB"}) as connection:
+        for table in HISTORY_TABLES:
+            connection.register(table, _dataset(root, table))
+        for view in VIEWS:
+            connection.execute((files("warehouse") / "views" / f"{view}.sql").read_text(encoding="utf-8"))
+        connection.execute("SET TimeZone = 'UTC'")
+        connection.execute("SET enable_external_access = false")
+        connection.execute("SET lock_configuration = true")
+        with _sentences(timeout_s, memory_mb), _time_limit(connection, timeout_s):
+            statement = _one_reading_statement(connection, query)
+            return _result(connection.sql(statement, params=parameters), max_result_mb)
+
+
+def _dataset(root: Path, table: str) -> pa.dataset.Dataset:
+    """The table's files, each known by its vehicle, so that a query for one vehicle opens one file."""
+    schema = schemas.arrow_schema(table).remove_metadata()
+    parquet = pa.dataset.ParquetFileFormat()
+    filesystem = pa.fs.LocalFileSystem()
+    fragments = []
+    for path in history_files(root, table):
+        vehicle_id = vehicle_of(path)
+        known = None if vehicle_id is None else pa.dataset.field("vehicle_id") == vehicle_id
+        fragments.append(parquet.make_fragment(str(path), filesystem, partition_expression=known))
+    return pa.dataset.FileSystemDataset(fragments, schema, parquet, filesystem)
+
+
+def _one_reading_statement(connection: duckdb.DuckDBPyConnection, query: str) -> duckdb.Statement:
+    statements = connection.extract_statements(query)
+    kinds = [statement.type.name for statement in statements]
+    if len(kinds) == 1 and kinds[0] in _READING:
+        return statements[0]
+    what = "nothing" if not kinds else ", ".join(kinds)
+    raise WarehouseError(
+        "sql_refused", f"Only a single SELECT is answered here; this is {what}. The tables are read-only."
+    )
+
+
+def _result(answer: duckdb.DuckDBPyRelation, max_result_mb: int) -> pl.DataFrame:
+    reader: pa.RecordBatchReader = answer.to_arrow_reader(_ROWS_PER_BATCH)
+    batches: list[pa.RecordBatch] = []
+    size = 0
+    for batch in reader:
+        size += batch.nbytes
+        if size > max_result_mb << 20:
+            raise WarehouseError(
+                "sql_too_large", f"The result is larger than {max_result_mb} MB; aggregate it or add a LIMIT."
+            )
+        batches.append(batch)
+    return frame(pa.Table.from_batches(batches, schema=reader.schema))
+
+
+@contextmanager
+def _time_limit(connection: duckdb.DuckDBPyConnection, timeout_s: float) -> Iterator[None]:
+    timer = threading.Timer(timeout_s, connection.interrupt)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@contextmanager
+def _sentences(timeout_s: float, memory_mb: int) -> Iterator[None]:
+    """DuckDB's errors as ours."""
+    try:
+        yield
+    except duckdb.InterruptException as error:
+        raise WarehouseError("sql_timeout", f"The query took longer than {timeout_s:g} s and was stopped.") from error
+    except duckdb.OutOfMemoryException as error:
+        raise WarehouseError(
+            "sql_too_large", f"The query needs more than {memory_mb} MB; narrow it, for instance by vehicle_id."
+        ) from error
+    except duckdb.PermissionException as error:
+        raise WarehouseError(
+            "sql_refused", "Files and extensions are out of reach of SQL here: it reads the warehouse's tables only."
+        ) from error
+    except duckdb.Error as error:
+        raise WarehouseError("sql_wrong", f"The query cannot be answered: {str(error).strip()}") from error

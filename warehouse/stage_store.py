@@ -1,0 +1,128 @@
+"""The cache of stages: one folder an execution, complete when its `run.json` says so and what it lists is whole.
+
+It may be deleted at any time, in whole or in part.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from warehouse.errors import WarehouseError, disk
+from warehouse.files import sync_folder, write_bytes
+from warehouse.layout import prepare, stage_folder
+from warehouse.sealed import BrokenSeal, seal, unseal
+from warehouse.store import frame, read_arrow, write_table
+
+RECORD = "run.json"
+
+
+class StageStore:
+    """Outputs of stages below a data root, by stage, flight and run key."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def folder(self, stage: str, flight_id: str, run_key: str) -> Path:
+        """Where this execution's outputs are or would be."""
+        return stage_folder(self.root, stage, flight_id, run_key)
+
+    def record(self, stage: str, flight_id: str, run_key: str) -> dict[str, Any] | None:
+        """What `save` was given as record, with `outputs` added; None when absent, torn or of another execution."""
+        path = self.folder(stage, flight_id, run_key) / RECORD
+        try:
+            found = unseal(path.read_bytes())
+        except (OSError, BrokenSeal):
+            return None
+        same = (found.get("stage"), found.get("flight_id"), found.get("run_key")) == (stage, flight_id, run_key)
+        return found if same else None
+
+    def complete(self, stage: str, flight_id: str, run_key: str) -> dict[str, Any] | None:
+        """The record, if the execution is complete: every output there with the sha256 it says; else None.
+
+        The record's `outputs` is `{table: {"file", "sha256", "bytes", "rows"}}`.
+        """
+        record = self.record(stage, flight_id, run_key)
+        if record is None:
+            return None
+        return None if any(broken_outputs(self.folder(stage, flight_id, run_key), record)) else record
+
+    def save(
+        self,
+        stage: str,
+        flight_id: str,
+        run_key: str,
+        tables: Mapping[str, pl.DataFrame],
+        record: Mapping[str, Any],
+        *,
+        units: Mapping[str, str] | None = None,
+    ) -> dict[str, Any]:
+        """Write the outputs and, last, the record; the record as `complete` returns it.
+
+        `record` is plain JSON (no NaN, no numpy values); the keys stage, flight_id, run_key and outputs are set here.
+        """
+        folder = self.folder(stage, flight_id, run_key)
+        prepare(self.root)
+        with disk(folder, "written"):
+            if (folder / RECORD).exists():
+                (folder / RECORD).unlink()
+                sync_folder(folder)
+        outputs = {}
+        for table, rows in tables.items():
+            path = folder / f"{table}.parquet"
+            sha256 = write_table(rows, table, path, stage=True, units=units)
+            outputs[table] = {"file": path.name, "sha256": sha256, "bytes": path.stat().st_size, "rows": rows.height}
+        own = {"stage": stage, "flight_id": flight_id, "run_key": run_key, "outputs": outputs}
+        sealed = seal({**record, **own})
+        write_bytes(folder / RECORD, sealed)
+        return unseal(sealed)
+
+    def load(
+        self, stage: str, flight_id: str, run_key: str, tables: Iterable[str] | None = None
+    ) -> dict[str, pl.DataFrame]:
+        """Outputs of a complete execution (those named, or all), each checked against its sha256.
+
+        Raises
+        ------
+        WarehouseError
+            `stage_incomplete`: there is no such complete execution, or not that table in it.
+        """
+        folder = self.folder(stage, flight_id, run_key)
+        record = self.record(stage, flight_id, run_key)
+        if record is None:
+            raise WarehouseError(
+                "stage_incomplete", f"{folder} holds no complete result of stage {stage}; run it again."
+            )
+        outputs = record["outputs"]
+        wanted = list(outputs if tables is None else tables)
+        if absent := [table for table in wanted if table not in outputs]:
+            raise WarehouseError(
+                "stage_incomplete", f"stage {stage} of this run wrote no table {absent[0]} ({folder})."
+            )
+        return {table: _output(folder, table, outputs[table]) for table in wanted}
+
+
+def broken_outputs(folder: Path, record: Mapping[str, Any]) -> Iterator[tuple[Path, str]]:
+    """Outputs that are not what the record says, each with what is wrong."""
+    for output in record["outputs"].values():
+        path = folder / str(output["file"])
+        try:
+            data = path.read_bytes() if path.stat().st_size == output["bytes"] else b""
+        except OSError:
+            yield path, "it is missing"
+            continue
+        if hashlib.sha256(data).hexdigest() != output["sha256"]:
+            yield path, "its content is not what was written: the sha256 differs"
+
+
+def _output(folder: Path, table: str, output: Mapping[str, Any]) -> pl.DataFrame:
+    path = folder / str(output["file"])
+    with disk(path, "read"):
+        data = path.read_bytes()
+    if hashlib.sha256(data).hexdigest() != output["sha256"]:
+        raise WarehouseError("stage_incomplete", f"{path} is not what the stage wrote; run the stage again.")
+    return frame(read_arrow(data, table, stage=True, name=str(path)))

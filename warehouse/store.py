@@ -1,0 +1,254 @@
+"""Parquet: the only place that writes or reads it.
+
+Every file carries its table's schema (unit and meaning of every column) and a checksum for every page; reading verifies
+both. Floats are dictionary-encoded, time stamps delta-encoded, pages compressed with zstd. Equal data give equal bytes.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TypeAlias
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+import schemas
+from schemas import SchemaMismatch
+from warehouse.errors import WarehouseError, disk
+from warehouse.files import AtomicFile
+
+Data: TypeAlias = pl.DataFrame | pa.Table | pa.RecordBatch | Mapping[str, np.ndarray]
+
+_ROWS_PER_GROUP = 131_072
+
+
+class TableWriter:
+    """Write a table in batches; it appears at `path` when the block ends without an error, else nothing does.
+
+    Parameters
+    ----------
+    table : str
+        Table whose columns the batches have (in any order).
+    path : Path
+        Final place.
+    stage : bool
+        The table as a stage writes it.
+    units, metadata : mapping, optional
+        Real units of logged columns, and facts for the file's metadata (`schemas.arrow_schema`).
+    before_rename : callable, optional
+        Called with the sha256 just before the file gets its final name.
+
+    Attributes
+    ----------
+    sha256 : str
+        sha256 of the file, once the block has ended.
+    n_rows : int
+        Rows written so far.
+    """
+
+    def __init__(
+        self,
+        table: str,
+        path: Path,
+        *,
+        stage: bool = False,
+        units: Mapping[str, str] | None = None,
+        metadata: Mapping[str, str] | None = None,
+        before_rename: Callable[[str], None] | None = None,
+    ) -> None:
+        self.table = table
+        self.path = path
+        self.sha256 = ""
+        self.n_rows = 0
+        self._stage = stage
+        self._schema = schemas.arrow_schema(table, stage=stage, units=units, metadata=metadata)
+        self._file = AtomicFile(path, before_rename)
+        try:
+            self._parquet = pq.ParquetWriter(self._file, self._schema, **_options(self._schema))
+        except BaseException:
+            self._file.close()
+            raise
+        self._waiting: list[pa.Table] = []
+        self._n_waiting = 0
+
+    def write(self, data: Data) -> None:
+        """Append rows. Few rows at a time are fine: they are gathered into row groups of one size.
+
+        Raises
+        ------
+        SchemaMismatch
+            Columns are missing, additional or of the wrong type, or a column of the key holds nulls.
+        """
+        rows = conform(data, self.table, self._schema, stage=self._stage)
+        self._waiting.append(rows)
+        self._n_waiting += rows.num_rows
+        self.n_rows += rows.num_rows
+        if self._n_waiting >= _ROWS_PER_GROUP:
+            self._flush(everything=False)
+
+    def _flush(self, *, everything: bool) -> None:
+        rows = pa.concat_tables(self._waiting) if self._waiting else self._schema.empty_table()
+        whole = rows.num_rows if everything else rows.num_rows - rows.num_rows % _ROWS_PER_GROUP
+        if whole:
+            self._parquet.write_table(rows.slice(0, whole).combine_chunks(), row_group_size=_ROWS_PER_GROUP)
+        self._waiting = [rows.slice(whole)]
+        self._n_waiting = rows.num_rows - whole
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                self._flush(everything=True)
+                self._parquet.close()
+                self.sha256 = self._file.commit()
+            else:
+                with suppress(Exception):
+                    self._parquet.close()
+        finally:
+            self._file.close()
+
+
+def write_table(
+    data: Data,
+    table: str,
+    path: Path,
+    *,
+    stage: bool = False,
+    units: Mapping[str, str] | None = None,
+    metadata: Mapping[str, str] | None = None,
+    before_rename: Callable[[str], None] | None = None,
+) -> str:
+    """Write a whole table, atomically and durably; the sha256 of the file. Parameters as in `TableWriter`."""
+    writer = TableWriter(table, path, stage=stage, units=units, metadata=metadata, before_rename=before_rename)
+    with writer:
+        writer.write(data)
+    return writer.sha256
+
+
+def table_bytes(data: Data, table: str) -> bytes:
+    """The bytes `write_table` would write."""
+    schema = schemas.arrow_schema(table)
+    buffer = io.BytesIO()
+    with pq.ParquetWriter(buffer, schema, **_options(schema)) as parquet:
+        parquet.write_table(conform(data, table, schema).combine_chunks(), row_group_size=_ROWS_PER_GROUP)
+    return buffer.getvalue()
+
+
+def read_table(path: Path, table: str, *, stage: bool = False) -> pl.DataFrame:
+    """Read a table, verifying page checksums and schema.
+
+    Raises
+    ------
+    WarehouseError
+        `damaged_file`, `schema_mismatch`, or the disk's refusal.
+    """
+    return frame(read_arrow(path, table, stage=stage))
+
+
+def read_arrow(source: Path | bytes, table: str, *, stage: bool = False, name: str = "") -> pa.Table:
+    """The same as an Arrow table, metadata kept; `source` may be the bytes of a file, called `name` in messages."""
+    shown = name or str(source if isinstance(source, Path) else "the file")
+    if isinstance(source, Path):
+        with disk(source, "read"):
+            source = source.read_bytes()
+    try:
+        with pq.ParquetFile(pa.BufferReader(source), page_checksum_verification=True) as file:
+            schemas.check(file.schema_arrow, table, stage=stage)
+            return file.read(columns=list(_names(table, stage)))
+    except SchemaMismatch as error:
+        raise WarehouseError("schema_mismatch", f"{shown}: {error}.") from error
+    except (pa.ArrowException, OSError, ValueError) as error:
+        first_line = (str(error).splitlines() or [type(error).__name__])[0]
+        raise WarehouseError(
+            "damaged_file", f"{shown} is damaged ({first_line}); `fieldcal verify` lists what else is."
+        ) from error
+
+
+def read_facts(path: Path) -> dict[str, str]:
+    """Facts in a file's metadata: table, version, and what its writer added."""
+    with disk(path, "read"), path.open("rb") as file:
+        metadata = pq.read_schema(file).metadata or {}
+    return {key.decode(): value.decode() for key, value in metadata.items()}
+
+
+def empty_frame(table: str, *, stage: bool = False) -> pl.DataFrame:
+    """A table without rows, its columns typed."""
+    return frame(schemas.arrow_schema(table, stage=stage).empty_table())
+
+
+def frame(rows: pa.Table) -> pl.DataFrame:
+    """An Arrow table as a polars frame."""
+    result = pl.from_arrow(rows)
+    if not isinstance(result, pl.DataFrame):
+        raise TypeError("a table is needed, not a column")
+    return result
+
+
+def conform(data: Data, table: str, schema: pa.Schema, *, stage: bool = False) -> pa.Table:
+    """`data` with exactly the columns and types of `schema`; integers and texts of another width are converted.
+
+    Raises
+    ------
+    SchemaMismatch
+        Columns are missing or additional, a conversion would lose something, or a column of the key holds nulls.
+    """
+    rows = _arrow(data)
+    missing = [name for name in schema.names if name not in rows.column_names]
+    extra = [name for name in rows.column_names if name not in schema.names]
+    if missing or extra:
+        raise SchemaMismatch(
+            f"these rows are not of the table {table}: missing {', '.join(missing) or 'nothing'}; "
+            f"not in the table: {', '.join(extra) or 'nothing'}"
+        )
+    columns = []
+    for field in schema:
+        column = rows.column(field.name)
+        if pa.types.is_integer(field.type) and pa.types.is_floating(column.type):
+            raise SchemaMismatch(f"column {field.name} of {table} must be whole numbers, not {column.type}")
+        try:
+            columns.append(column if column.type == field.type else column.cast(field.type))
+        except pa.ArrowException as error:
+            raise SchemaMismatch(f"column {field.name} of {table} cannot be {field.type}: {error}") from error
+    result = pa.Table.from_arrays(columns, schema=schema)
+    for name in schemas.table_key(table, stage=stage):
+        if nulls := result.column(name).null_count:
+            raise SchemaMismatch(f"column {name} of {table} identifies a row, yet {nulls} rows have none")
+    return result
+
+
+def _arrow(data: Data) -> pa.Table:
+    if isinstance(data, pl.DataFrame):
+        return data.to_arrow()
+    if isinstance(data, pa.RecordBatch):
+        return pa.Table.from_batches([data])
+    if isinstance(data, pa.Table):
+        return data
+    return pa.table({name: pa.array(np.ascontiguousarray(column)) for name, column in data.items()})
+
+
+def _names(table: str, stage: bool) -> tuple[str, ...]:
+    return tuple(column.name for column in schemas.table_columns(table, stage=stage))
+
+
+def _options(schema: pa.Schema) -> dict[str, object]:
+    stamps = [field.name for field in schema if field.name.endswith("_ns")]
+    return {
+        "version": "2.6",
+        "compression": "zstd",
+        "compression_level": 3,
+        "use_dictionary": [field.name for field in schema if field.name not in stamps],
+        "column_encoding": dict.fromkeys(stamps, "DELTA_BINARY_PACKED"),
+        "write_page_checksum": True,
+        "write_statistics": True,
+        "dictionary_pagesize_limit": 4 << 20,
+    }

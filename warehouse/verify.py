@@ -1,0 +1,114 @@
+"""Check every file that is kept against its recorded sha256, and the sources against theirs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from fieldcal.errors import FieldcalError
+from warehouse import checksums
+from warehouse.content import content_sha256
+from warehouse.errors import WarehouseError, disk
+from warehouse.files import TEMPORARY, file_sha256
+from warehouse.layout import history_files
+from warehouse.sealed import BrokenSeal, unseal
+from warehouse.stage_store import RECORD, broken_outputs
+from warehouse.store import read_table
+
+Problem = tuple[str, str | None]
+"""A path as shown, and what is wrong with it (None: nothing)."""
+
+
+def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path], str] | None = None) -> dict[str, Any]:
+    """Check `tables/`, `signals/`, complete stage outputs and, with `archive`, the logs. Nothing is changed.
+
+    Parameters
+    ----------
+    archive : Path, optional
+        Archive whose logs are compared with the `flight` table.
+    log_sha256 : callable, optional
+        sha256 of a log (a file or a folder) as ingest computes it; needed with `archive`.
+
+    Returns
+    -------
+    dict
+        `ok`, `files` (how many were checked), `damaged` (a list of `{"path", "reason"}`, paths relative to `root` or
+        `archive`), `content_sha256` (of what `tables/` say; None when a table cannot be read).
+
+    Raises
+    ------
+    WarehouseError
+        `no_warehouse`: there is nothing at `root`.
+    """
+    if not root.is_dir():
+        raise WarehouseError(
+            "no_warehouse", f"There is no warehouse at {root}; run `fieldcal nightly` or give --warehouse."
+        )
+    found = [*_recorded_files(root), *_stage_files(root)]
+    if archive is not None:
+        if log_sha256 is None:
+            raise ValueError("log_sha256 is needed to check an archive")
+        found += _logs(root, archive, log_sha256)
+    damaged = [{"path": path, "reason": reason} for path, reason in found if reason is not None]
+    try:
+        content = content_sha256(root)
+    except WarehouseError:
+        content = None
+    return {"ok": not damaged, "files": len(found), "damaged": damaged, "content_sha256": content}
+
+
+def _recorded_files(root: Path) -> Iterator[Problem]:
+    """Files of the history and the signals: those there, and those that should be."""
+    paths = {path for part in ("tables", "signals") for path in (root / part).rglob("*") if _kept(path)}
+    records = root / "checksums"
+    paths |= {
+        root / path.relative_to(records).with_name(path.name.removesuffix(".json")) for path in records.rglob("*.json")
+    }
+    for path in sorted(paths):
+        try:
+            sha256 = file_sha256(path) if path.exists() else None
+            yield str(path.relative_to(root)), checksums.problem(root, path, sha256)
+        except WarehouseError as error:
+            yield str(path.relative_to(root)), error.sentence
+
+
+def _kept(path: Path) -> bool:
+    return path.is_file() and not (path.name.startswith(".") and path.name.endswith(TEMPORARY))
+
+
+def _stage_files(root: Path) -> Iterator[Problem]:
+    """Records of complete executions and the outputs they list. A folder without a record is merely unfinished."""
+    for path in sorted((root / "stages").glob(f"*/*/*/{RECORD}")):
+        shown = str(path.relative_to(root))
+        try:
+            with disk(path, "read"):
+                record = unseal(path.read_bytes())
+        except (BrokenSeal, WarehouseError) as error:
+            yield shown, f"the record of the execution is damaged: {error}"
+            continue
+        yield shown, None
+        broken = dict(broken_outputs(path.parent, record))
+        for output in record["outputs"].values():
+            file = path.parent / str(output["file"])
+            yield str(file.relative_to(root)), broken.get(file)
+
+
+def _logs(root: Path, archive: Path, log_sha256: Callable[[Path], str]) -> Iterator[Problem]:
+    for file in history_files(root, "flight"):
+        try:
+            rows = read_table(file, "flight")
+        except WarehouseError:
+            continue
+        for uri, sha256 in rows.select("log_uri", "log_sha256").iter_rows():
+            yield str(uri), _log_problem(archive / str(uri), sha256, log_sha256)
+
+
+def _log_problem(path: Path, sha256: str | None, log_sha256: Callable[[Path], str]) -> str | None:
+    if not path.exists():
+        return "the log is no longer in the archive"
+    try:
+        found = log_sha256(path)
+    except (OSError, FieldcalError) as error:
+        return f"the log cannot be read: {error}"
+    return None if found == sha256 else "the log is not the one that was calibrated: its sha256 differs"
