@@ -1,0 +1,109 @@
+"""Reading flight logs: one interface, one registry of formats.
+
+`find_logs` lists an archive, `open_log` streams one log as batches of signal tables, `read_log` loads one whole.
+Whatever is wrong with a file, reading it raises only `fieldcal.errors.UnreadableLog` or returns with findings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from fieldcal.errors import UnreadableLog
+from fieldcal.logs.csv import CsvLog
+from fieldcal.logs.discovery import find_logs, flight_id, log_format, log_sha256
+from fieldcal.logs.interface import (
+    SENSORS,
+    SIGNAL_COLUMNS,
+    UNKNOWN_UNIT,
+    Batch,
+    Columns,
+    Finding,
+    LogFile,
+    LogReader,
+    LogSummary,
+    VehicleLike,
+)
+from fieldcal.logs.mcap import McapLog
+
+READERS: dict[str, Callable[[Path, VehicleLike], LogReader]] = {"mcap": McapLog, "csv": CsvLog}
+"""Log format (as `discovery.log_format` names it) -> reader."""
+
+_NOT_YET = {"ulog": "PX4 ULog", "dataflash": "ArduPilot DataFlash"}
+
+
+def open_log(path: Path, vehicle: VehicleLike) -> LogReader:
+    """Open a log for streaming.
+
+    Parameters
+    ----------
+    path : Path
+        An `.mcap` or `.csv` file, or a folder with `imu.csv`.
+    vehicle : Vehicle
+        Configuration of its vehicle: topics, columns, units.
+
+    Raises
+    ------
+    UnreadableLog
+        With a reason code and a sentence. Iterating `batches()` may raise it too.
+    """
+    if not path.exists():
+        raise UnreadableLog("not_found", f"{path.name} does not exist. Check the path.")
+    kind = log_format(path)
+    if kind not in READERS:
+        what = _NOT_YET.get(kind or "", f"a {path.suffix or 'folder without imu.csv'}")
+        raise UnreadableLog(
+            "format_not_supported",
+            f"{path.name} is {what}, which cannot be read. Convert it to MCAP or CSV.",
+        )
+    return READERS[kind](path, vehicle)
+
+
+def read_log(path: Path, vehicle: VehicleLike) -> tuple[dict[str, pl.DataFrame], LogSummary]:
+    """A whole log in memory: signal table -> frame sorted by time, and the summary. Raises as `open_log`."""
+    reader = open_log(path, vehicle)
+    frames: dict[str, list[pl.DataFrame]] = {}
+    for table, columns in reader.batches():
+        frames.setdefault(table, []).append(batch_frame(table, columns))
+    whole = {table: pl.concat(parts).sort("t_ns", maintain_order=True) for table, parts in frames.items()}
+    return whole, reader.summary
+
+
+def batch_frame(table: str, columns: Columns) -> pl.DataFrame:
+    """A batch as a frame with every column of its signal table; those the log lacks are null."""
+    rows = len(columns["t_ns"])
+    series = []
+    for name in SIGNAL_COLUMNS[table]:
+        dtype = pl.Int64 if name == "t_ns" else pl.Float64
+        if name in columns:
+            series.append(pl.Series(name, np.ascontiguousarray(columns[name]), dtype))
+        else:
+            series.append(pl.Series(name, [None], dtype).new_from_index(0, rows))
+    return pl.DataFrame(series)
+
+
+__all__ = [
+    "READERS",
+    "SENSORS",
+    "SIGNAL_COLUMNS",
+    "UNKNOWN_UNIT",
+    "Batch",
+    "Columns",
+    "CsvLog",
+    "Finding",
+    "LogFile",
+    "LogReader",
+    "LogSummary",
+    "McapLog",
+    "VehicleLike",
+    "batch_frame",
+    "find_logs",
+    "flight_id",
+    "log_format",
+    "log_sha256",
+    "open_log",
+    "read_log",
+]
