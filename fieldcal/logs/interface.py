@@ -32,6 +32,12 @@ SIGNAL_COLUMNS: Mapping[str, tuple[str, ...]] = {
     "position": ("t_ns", "latitude_deg", "longitude_deg", "altitude_m"),
 }
 
+KNOWN_UNITS: Mapping[str, tuple[str, ...]] = {
+    "gyroscope": ("counts", "rad/s", "deg/s"),
+    "accelerometer": ("counts", "m/s^2", "g"),
+    "magnetometer": ("counts", "T", "uT", "G", "norm"),
+}
+
 EPOCH_KNOWN_AFTER_NS = 1_000_000_000 * 1_000_000_000
 """Stamps beyond 2001-09-09 are taken for Unix time, smaller ones for a clock with an unknown zero."""
 
@@ -128,6 +134,15 @@ def logged_units(
     units = {}
     for sensor in SENSORS:
         own, wanted = declared.get(sensor), configured.get(sensor)
+        if own and own not in KNOWN_UNITS[sensor]:
+            if not wanted:
+                summary.add(
+                    "unit_not_supported",
+                    1,
+                    f"{log_name}: the log gives its {sensor} in {own!r}, which is none of "
+                    f"{', '.join(KNOWN_UNITS[sensor])}. Convert the log.",
+                )
+            own = None
         if own and wanted and own != wanted:
             summary.add(
                 "unit_conflict",

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldcal.errors import UnreadableLog
-from fieldcal.logs.mcap_chunks import decompress, locate_messages
+from fieldcal.logs.mcap_chunks import CHUNK_CAP_BYTES, decompress, locate_messages
 from fieldcal.logs.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -237,6 +237,8 @@ class McapFile:
         """Head and content of the chunk at `start`, or why it cannot be read."""
         try:
             head = read_chunk_head(Fields(self.buffer, start + HEAD_BYTES, limit))
+            if head.uncompressed_size > CHUNK_CAP_BYTES:
+                raise Damage(f"the chunk declares {head.uncompressed_size} bytes, the cap is {CHUNK_CAP_BYTES}")
             if head.uncompressed_size > self._budget:
                 cap = max(TOTAL_CAP_BYTES, TOTAL_CAP_RATIO * self.size)
                 self.tally.stopped = f"decompressing more than {cap} bytes is refused"
@@ -330,7 +332,11 @@ class McapFile:
 
     def _next_loose(self, position: int) -> int | None:
         """The next of several sound records in a row, in a file that keeps its messages outside chunks."""
-        if self.tally.chunks or (self.statistics is not None and self.statistics.chunk_count):
+        if (
+            self.tally.chunks
+            or self.tally.damaged_chunks
+            or (self.statistics is not None and self.statistics.chunk_count)
+        ):
             return None
         for match in _LOOSE_PATTERN.finditer(self.buffer, position, self._limit):
             place: int | None = match.start()
