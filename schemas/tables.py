@@ -58,7 +58,16 @@ _STAGES = (
         "stage",
         1,
         "attitude from the two vectors",
-        (c.T_NS, c.SEGMENT, *c.QUATERNION, c.ATTITUDE_SD_RAD, c.TASTE, c.ACCELERATION_EXCESS_MPS2),
+        (
+            c.T_NS,
+            c.SEGMENT,
+            *c.QUATERNION,
+            c.ATTITUDE_SD_RAD,
+            c.TASTE,
+            c.ACCELERATION_EXCESS_MPS2,
+            c.FIELD_EXCESS,
+            c.ATTITUDE_WEIGHT,
+        ),
         ("t_ns",),
     ),
     Table(

@@ -1,0 +1,227 @@
+"""The whole data path, as one tuple: who reads what, who writes what, and which settings matter.
+
+Tables are named `stage.table`; the log's own are `ingest.imu`, `ingest.magnetometer`, … . `run_flight` walks it in memory; the
+night walks the same tuple through its cache.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import polars as pl
+
+from fieldcal import stages, validation
+from fieldcal.results import StageResult
+
+Run = Callable[[Mapping[str, pl.DataFrame], Mapping[str, Any]], StageResult]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage: `reads` maps the function's own names to `stage.table`, `needs` are those it cannot do without."""
+
+    name: str
+    function: Run
+    reads: Mapping[str, str]
+    needs: tuple[str, ...]
+    writes: tuple[str, ...]
+    settings: tuple[str, ...]
+
+
+ELLIPSOID = (
+    "ellipsoid",
+    "ellipsoid_max_condition",
+    "ellipsoid_max_scale_sd",
+    "ellipsoid_max_residual",
+    "polarity",
+    "units",
+    "nominal_scale",
+    "reference_reading",
+)
+AXES = ("rotation_body_from_sensor", "body")
+SMOOTHING = ("smoothing_cutoff_hz", "smoothing_ends", "smoothing_side_s")
+VECTORS = ("attitude", "field_ned", "gravity_mps2", "gravity_sign", "nominal_scale", "polarity", "units", *AXES)
+GYRO = ("gyro_max_scale_sd", "nominal_scale", "polarity", "units", "reference_reading", *AXES)
+SAMPLES = {"samples": "smoothing.samples", "temperature": "ingest.temperature"}
+MAGNETOMETER = {"magnetometer": "magnetometer.calibration", "magnetometer_covariance": "magnetometer.covariance"}
+
+PIPELINE: tuple[Stage, ...] = (
+    Stage(
+        "manoeuvre",
+        stages.find_manoeuvre,
+        {"imu": "ingest.imu"},
+        ("imu",),
+        ("segments",),
+        (
+            "manoeuvre_window_s",
+            "manoeuvre_pad_s",
+            "manoeuvre_rest_s",
+            "manoeuvre_min_s",
+            "manoeuvre_max_gap_s",
+            "manoeuvre_excited_ratio",
+        ),
+    ),
+    Stage(
+        "smoothing",
+        stages.smooth,
+        {"imu": "ingest.imu", "magnetometer": "ingest.magnetometer", "segments": "manoeuvre.segments"},
+        ("imu", "segments"),
+        ("samples",),
+        SMOOTHING,
+    ),
+    Stage(
+        "magnetometer",
+        stages.calibrate_magnetometer,
+        {**SAMPLES, "magnetometer": "ingest.magnetometer", "segments": "manoeuvre.segments"},
+        ("samples", "segments"),
+        ("calibration", "covariance"),
+        (*ELLIPSOID, "field_ned", "field_unit"),
+    ),
+    Stage(
+        "accelerometer",
+        stages.calibrate_accelerometer,
+        SAMPLES,
+        ("samples",),
+        ("calibration", "covariance"),
+        (*ELLIPSOID, "gravity_mps2"),
+    ),
+    Stage(
+        "attitude",
+        stages.estimate_attitude,
+        {**SAMPLES, **MAGNETOMETER, "accelerometer": "accelerometer.calibration"},
+        ("samples",),
+        ("attitude",),
+        (*VECTORS, "field_source"),
+    ),
+    Stage(
+        "gyro_equation",
+        stages.calibrate_gyro_equation,
+        {**SAMPLES, "attitude": "attitude.attitude"},
+        ("samples", "attitude"),
+        ("calibration", "covariance"),
+        (*GYRO, "equations", "differentiation_window_s"),
+    ),
+    # Second pass, now with rates: lever arm (Eq. 3) and sample gate.
+    Stage(
+        "accelerometer_pass2",
+        stages.calibrate_accelerometer_gated,
+        {
+            **SAMPLES,
+            "accelerometer": "accelerometer.calibration",
+            "covariance": "accelerometer.covariance",
+            "gyroscope": "gyro_equation.calibration",
+        },
+        ("samples",),
+        ("calibration", "covariance"),
+        (
+            *ELLIPSOID,
+            *AXES,
+            "gravity_mps2",
+            "gravity_sign",
+            "lever_arm_m",
+            "gate_norm",
+            "gate_rate_radps",
+            "differentiation_window_s",
+        ),
+    ),
+    Stage(
+        "attitude_pass2",
+        stages.estimate_attitude,
+        {**SAMPLES, **MAGNETOMETER, "accelerometer": "accelerometer_pass2.calibration"},
+        ("samples",),
+        ("attitude",),
+        (*VECTORS, "field_source"),
+    ),
+    Stage(
+        "gyro_equation_pass2",
+        stages.calibrate_gyro_equation,
+        {**SAMPLES, "attitude": "attitude_pass2.attitude"},
+        ("samples", "attitude"),
+        ("calibration", "covariance"),
+        (*GYRO, "equations", "differentiation_window_s"),
+    ),
+    Stage(
+        "gyro_output",
+        stages.calibrate_gyro_output,
+        {
+            **SAMPLES,
+            **MAGNETOMETER,
+            "accelerometer": "accelerometer_pass2.calibration",
+            "accelerometer_covariance": "accelerometer_pass2.covariance",
+            "attitude": "attitude_pass2.attitude",
+            "gyroscope": "gyro_equation_pass2.calibration",
+        },
+        ("samples", "attitude", "gyroscope"),
+        ("calibration", "covariance"),
+        (*GYRO, *VECTORS, "gyro_output", "initial_attitude", "shooting_s"),
+    ),
+    Stage(
+        "vps_sync",
+        validation.synchronise_vps,
+        {
+            "imu": "ingest.imu",
+            "vps": "ingest.vps",
+            "attitude": "attitude_pass2.attitude",
+            "gyro_equation": "gyro_equation_pass2.calibration",
+            "gyro_output": "gyro_output.calibration",
+        },
+        ("imu",),
+        ("sync", "vps_aligned"),
+        (*AXES, "world", "polarity", "nominal_scale", "vps_max_lag_s", "vps_min_peak", "vps_max_gap_s"),
+    ),
+    Stage(
+        "verify",
+        validation.verify_fit,
+        {
+            **SAMPLES,
+            "magnetometer": "magnetometer.calibration",
+            "accelerometer": "accelerometer_pass2.calibration",
+            "attitude": "attitude_pass2.attitude",
+            "gyro_equation": "gyro_equation_pass2.calibration",
+            "gyro_output": "gyro_output.calibration",
+            "vps_aligned": "vps_sync.vps_aligned",
+        },
+        ("samples", "attitude"),
+        ("fit",),
+        (*VECTORS, *SMOOTHING, "differentiation_window_s", "initial_attitude"),
+    ),
+)
+
+# Which stage's table is the flight's word, for each published table.
+PUBLISHED: dict[str, tuple[str, ...]] = {
+    "calibration": (
+        "magnetometer.calibration",
+        "accelerometer_pass2.calibration",
+        "gyro_equation_pass2.calibration",
+        "gyro_output.calibration",
+    ),
+    "fit": ("verify.fit",),
+    "sync": ("vps_sync.sync",),
+}
+
+
+def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: Mapping[str, Any]) -> StageResult:
+    """Run one stage on `stage.table` tables; missing needs end as a refusal that names them."""
+    inputs = {own: tables[name] for own, name in stage.reads.items() if name in tables}
+    for need in stage.needs:
+        if need not in inputs:
+            source = stage.reads[need].split(".")[0]
+            return StageResult(
+                status="refused",
+                reason_code=f"no_{need}",
+                reason=f"{stage.name} needs {stage.reads[need]}, which {source} could not give.",
+            )
+    return stage.function(inputs, {name: settings[name] for name in stage.settings})
+
+
+def run_flight(signals: Mapping[str, pl.DataFrame], settings: Mapping[str, Any]) -> dict[str, StageResult]:
+    """All stages of one flight, in memory: signal table name → frame in, stage name → result out."""
+    tables = {f"ingest.{name}": frame for name, frame in signals.items()}
+    results: dict[str, StageResult] = {}
+    for stage in PIPELINE:
+        result = run_stage(stage, tables, settings)
+        results[stage.name] = result
+        tables |= {f"{stage.name}.{name}": frame for name, frame in result.tables.items()}
+    return results

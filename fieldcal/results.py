@@ -1,0 +1,87 @@
+"""Results as table rows: what a fitted triad says in the `calibration` table, and what a stage hands back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import ArrayLike
+
+from fieldcal.frames import AXES
+from fieldcal.rotation import Array
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """Tables that a stage made, how it ended and the numbers that decided it.
+
+    `status`: "ok"; "refused": the recording does not determine it (tables may still carry refused values); "absent": there is
+    nothing to do (no VPS in the log); "failed": an error of ours, told in `reason`.
+    """
+
+    tables: dict[str, pl.DataFrame] = field(default_factory=dict)
+    status: str = "ok"
+    reason_code: str | None = None
+    reason: str | None = None
+    measured: dict[str, Any] = field(default_factory=dict)
+
+
+def triad_rows(
+    sensor: str,
+    method: str,
+    scale: ArrayLike,
+    bias: ArrayLike,
+    covariance: Array,
+    *,
+    unit: str,
+    logged_unit: str,
+    reference_reading: ArrayLike,
+    temperature_degc: float | None,
+    status: tuple[str, str, str] = ("ok", "ok", "ok"),
+    reason_code: tuple[str | None, str | None, str | None] = (None, None, None),
+) -> list[dict[str, Any]]:
+    """Rows scale, bias, zero and zero_bias of one triad with their standard deviations.
+
+    `scale` (3, 3), `bias` (3,), `covariance` (6, 6) of (λx, λy, λz, bx, by, bz). zero = −b/λ in logged units;
+    zero_bias = λ d0 + b at `reference_reading` d0 (3,). Off-diagonal scales (full form) carry no sd.
+    """
+    matrix, b, d0 = (np.asarray(v, dtype=float) for v in (scale, bias, reference_reading))
+    scale_unit = f"{unit}/{logged_unit}"
+    rows: list[dict[str, Any]] = []
+
+    def add(parameter: str, axis: str, i: int, value: float, variance: float | None, row_unit: str) -> None:
+        finite = variance is not None and np.isfinite(variance) and variance >= 0
+        rows.append(
+            {
+                "sensor": sensor,
+                "method": method,
+                "parameter": parameter,
+                "axis": axis,
+                "value": float(value) if np.isfinite(value) else None,
+                "sd": float(np.sqrt(variance)) if finite and variance is not None else None,
+                "unit": row_unit,
+                "temperature_degc": temperature_degc,
+                "status": status[i],
+                "reason_code": reason_code[i],
+            }
+        )
+
+    full = not np.array_equal(matrix, np.diag(np.diagonal(matrix)))
+    zero_full = -np.linalg.solve(matrix, b) if full else -b / np.diagonal(matrix)
+    offset_full = matrix @ d0 + b
+    for i, axis in enumerate(AXES):
+        lam, own = matrix[i, i], np.ix_([i, 3 + i], [i, 3 + i])
+        c = covariance[own]
+        add("scale", axis, i, lam, c[0, 0], scale_unit)
+        add("bias", axis, i, b[i], c[1, 1], unit)
+        to_zero = np.array([b[i] / lam**2, -1.0 / lam])
+        add("zero", axis, i, zero_full[i], to_zero @ c @ to_zero, logged_unit)
+        to_offset = np.array([d0[i], 1.0])
+        add("zero_bias", axis, i, offset_full[i], to_offset @ c @ to_offset, unit)
+    if full:
+        for i, row in enumerate(AXES):
+            for j, column in enumerate(AXES):
+                add("scale", row + column, i, matrix[i, j], covariance[i, i] if i == j else None, scale_unit)
+    return rows

@@ -1,0 +1,81 @@
+"""Standard errors of least squares when residuals are correlated in time (after Morelli and Klein, 1997): every fit of
+fieldcal states its covariance through this page."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import fft
+
+from fieldcal.rotation import Array
+
+MAD_TO_SIGMA = 1.4826
+HUBER = 1.345
+
+
+def robust_sigma(residual: ArrayLike) -> float:
+    """Standard deviation from the median absolute value (the residual is centred already)."""
+    return MAD_TO_SIGMA * float(np.median(np.abs(residual)))
+
+
+def huber_weights(residual: ArrayLike, sigma: float) -> Array:
+    """Weights min(1, 1.345 σ/|r|), same shape as the residual; all ones when σ is 0."""
+    magnitude = np.abs(np.asarray(residual, dtype=float))
+    limit = HUBER * sigma
+    if limit == 0.0:
+        return np.ones_like(magnitude)
+    return np.where(magnitude > limit, limit / np.maximum(magnitude, limit), 1.0)
+
+
+def coloured_information(sensitivity: ArrayLike, residual: ArrayLike) -> Array:
+    """Σ_i Σ_j S_iᵀ 𝓡(i−j) S_j, the middle of the coloured-residual covariance.
+
+    𝓡 is the biased autocorrelation of each residual channel under a triangular taper of N/10 lags: its spectrum cannot be
+    negative, unlike the unbiased one's. By FFT.
+
+    Parameters
+    ----------
+    sensitivity : (n, c, p) array
+        Derivative of the model of each of c channels with respect to p parameters (weights already in).
+    residual : (n, c) array
+        Residuals in the same weighting.
+
+    Returns
+    -------
+    (p, p) array
+    """
+    s, r = np.asarray(sensitivity, dtype=float), np.asarray(residual, dtype=float)
+    n = len(r)
+    size = fft.next_fast_len(2 * n, real=True)
+    correlation = fft.irfft(np.abs(fft.rfft(r, size, axis=0)) ** 2, size, axis=0) / n
+    lags = max(1, n // 10)
+    taper = np.zeros(size)
+    taper[: lags + 1] = 1.0 - np.arange(lags + 1) / (lags + 1)
+    taper[-lags:] = taper[lags:0:-1]
+    spectrum = np.maximum(fft.rfft(correlation * taper[:, None], size, axis=0).real, 0.0)
+    # Parseval over the half spectrum: every bin but the first (and an even size's last) stands for two.
+    twice = np.full(len(spectrum), 2.0)
+    twice[0] = 1.0
+    if size % 2 == 0:
+        twice[-1] = 1.0
+    middle = np.zeros((s.shape[2], s.shape[2]))
+    for channel in range(s.shape[1]):
+        transform = fft.rfft(s[:, channel, :], size, axis=0)
+        weighted = transform * (spectrum[:, channel] * twice / size)[:, None]
+        middle += (transform.conj().T @ weighted).real
+    return middle
+
+
+def least_squares_covariance(sensitivity: ArrayLike, residual: ArrayLike) -> tuple[Array, Array]:
+    """Covariances of a least-squares fit: (Cramér–Rao σ²M⁻¹, coloured M⁻¹[ΣΣ Sᵀ𝓡S]M⁻¹), each (p, p).
+
+    `sensitivity` (n, c, p) and `residual` (n, c) as in `coloured_information`. Publish the second.
+    """
+    s, r = np.asarray(sensitivity, dtype=float), np.asarray(residual, dtype=float)
+    n, channels, p = s.shape
+    flat = s.reshape(n * channels, p)
+    scale = np.linalg.norm(flat, axis=0)
+    scale[scale == 0.0] = 1.0
+    inverse = np.linalg.pinv((flat / scale).T @ (flat / scale), hermitian=True) / np.outer(scale, scale)
+    sigma_squared = float(np.sum(r * r)) / max(1, n * channels - p)
+    return sigma_squared * inverse, inverse @ coloured_information(s, r) @ inverse
