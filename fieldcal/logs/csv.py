@@ -43,8 +43,8 @@ class CsvTable:
 
     Parameters
     ----------
-    path : Path
-        The file.
+    path, name : Path, str
+        The file, and what sentences call it.
     vehicle : Vehicle
         Its `csv` and `units`.
     tables : tuple of str
@@ -53,8 +53,10 @@ class CsvTable:
         Receives findings and counts.
     """
 
-    def __init__(self, path: Path, vehicle: VehicleLike, tables: tuple[str, ...], summary: LogSummary) -> None:
-        self._name = path.name if path.parent.name == "" else f"{path.parent.name}/{path.name}"
+    def __init__(
+        self, path: Path, name: str, vehicle: VehicleLike, tables: tuple[str, ...], summary: LogSummary
+    ) -> None:
+        self._name = name
         self._summary = summary
         self._csv = vehicle.csv
         self._blocks = LineBlocks(path)
@@ -265,13 +267,14 @@ class CsvLog:
 
     def _opened(self, path: Path, vehicle: VehicleLike) -> Iterator[CsvTable]:
         if not path.is_dir():
-            yield CsvTable(path, vehicle, ("imu", "vps"), self.summary)
+            yield CsvTable(path, path.name, vehicle, ("imu", "vps"), self.summary)
             return
         has_vps = (path / "vps.csv").is_file()
-        yield CsvTable(path / "imu.csv", vehicle, ("imu",) if has_vps else ("imu", "vps"), self.summary)
+        tables = ("imu",) if has_vps else ("imu", "vps")
+        yield CsvTable(path / "imu.csv", f"{path.name}/imu.csv", vehicle, tables, self.summary)
         if has_vps:
             try:
-                yield CsvTable(path / "vps.csv", vehicle, ("vps",), self.summary)
+                yield CsvTable(path / "vps.csv", f"{path.name}/vps.csv", vehicle, ("vps",), self.summary)
             except UnreadableLog as error:
                 self._without_vps(error)
 

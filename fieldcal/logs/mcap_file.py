@@ -58,6 +58,7 @@ TOTAL_CAP_RATIO = 200
 
 MESSAGES_AT_ONCE = 1 << 16
 LOOSE_BYTES = 4 << 20
+RELEASE_BYTES = 64 << 20
 _CRC_PIECE_BYTES = 16 << 20
 _LOOSE_CHAIN = 4
 _CHUNK_PATTERN = re.compile(rb"\x06.{5}\x00{3}.{21}\x00{3}.{4}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd)", re.DOTALL)
@@ -101,6 +102,7 @@ class McapFile:
         self._budget = max(TOTAL_CAP_BYTES, TOTAL_CAP_RATIO * self.size)
         self._seen: dict[tuple[int, int, int, int], tuple[int, int]] = {}
         self._lost_chunk = False
+        self._released = 0
         self._limit = self.size
         self._data_end: int | None = None
         self._has_end = self.buffer[-len(MAGIC) :] == MAGIC and self.size >= 2 * len(MAGIC) + FOOTER_BYTES
@@ -123,6 +125,7 @@ class McapFile:
         """The messages of every intact stretch, in file order. Definitions and the tally grow on the way."""
         position: int | None = self._begin
         while position is not None and position < self._limit and not self.tally.ended and not self.tally.stopped:
+            self._release(position)
             record = self._sound_record(position)
             if record is None:
                 declared_end = self._declared_end(position)
@@ -137,6 +140,13 @@ class McapFile:
                 position = self._other(record)
         if self._data_end is not None and position == self._limit and not self.tally.ended:
             self.tally.ended = True
+
+    def _release(self, position: int) -> None:
+        """Let go of mapped pages that were read, so that a file larger than the memory can pass through it."""
+        if position - self._released >= RELEASE_BYTES:
+            passed = position // mmap.ALLOCATIONGRANULARITY * mmap.ALLOCATIONGRANULARITY
+            self.buffer.madvise(mmap.MADV_DONTNEED, 0, passed)
+            self._released = position
 
     def _sound_record(self, position: int) -> Record | None:
         """The record at `position`; None, and an entry in the tally, when it is damaged."""
