@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from logs_support import vehicle
 
+from fieldcal.configuration import LogsMap
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs import find_logs, flight_id, log_sha256, open_log
 
@@ -60,13 +61,12 @@ def test_links_out_of_the_archive_and_loops_are_not_followed(archive: Path, tmp_
 
 
 def test_archives_of_another_shape_are_mapped(archive: Path) -> None:
-    mapping = [
-        {"glob": "*.mcap", "vehicle": "solo", "session": "all"},
-        {"glob": "b/*/*", "vehicle": "B", "session": "x"},
-    ]
+    touch(archive / "deep" / "x" / "y" / "log.mcap")
+    mapping = [LogsMap("*.mcap", "solo"), LogsMap("b/*/*", "B"), LogsMap("deep/**/*.mcap", session="all")]
     found = {log.log_uri: (log.vehicle_id, log.session_id) for log in find_logs(archive, mapping)}
-    assert found["loose.mcap"] == ("solo", "all")
-    assert found["b/s1/two.mcap"] == ("B", "x")
+    assert found["loose.mcap"] == ("solo", "loose")
+    assert found["b/s1/two.mcap"] == ("B", "s1")
+    assert found["deep/x/y/log.mcap"] == ("deep", "all")
     assert found["a/s1/f.bin"] == ("a", "s1")
 
 

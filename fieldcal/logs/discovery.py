@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 from fieldcal.logs.interface import LogFile
 
 LOG_FORMATS = {".mcap": "mcap", ".csv": "csv", ".ulg": "ulog", ".bin": "dataflash"}
 FOLDER_FORMAT = "csv"
 _READ_BYTES = 1 << 20
+
+
+class LogsEntry(Protocol):
+    """A glob relative to the archive, and the vehicle and session of what it matches (`configuration.LogsMap`)."""
+
+    @property
+    def glob(self) -> str: ...
+    @property
+    def vehicle(self) -> str | None: ...
+    @property
+    def session(self) -> str | None: ...
 
 
 def log_format(path: Path) -> str | None:
@@ -45,16 +56,17 @@ def flight_id(sha: str) -> str:
     return sha[:16]
 
 
-def find_logs(archive: Path, logs_map: Iterable[Mapping[str, Any]] | None = None) -> list[LogFile]:
+def find_logs(archive: Path, logs_map: Iterable[LogsEntry] | None = None) -> list[LogFile]:
     """All logs of an archive, sorted by their place in it.
 
     Parameters
     ----------
     archive : Path
         Root of the archive: `ARCHIVE/<vehicle_id>/<session_id>/<log>`.
-    logs_map : iterable of mappings, optional
-        `{"glob": ..., "vehicle": ..., "session": ...}` for archives of another shape, relative to the root. A log
-        matched here takes vehicle and session from the first entry that matches.
+    logs_map : iterable of LogsEntry, optional
+        For archives of another shape (`Configuration.logs`). A log matched here takes vehicle and session from the first
+        entry that matches; where an entry leaves one open, from the outermost and the innermost folder that the log
+        lies in, or from its own name when it lies in none.
 
     Notes
     -----
@@ -63,8 +75,9 @@ def find_logs(archive: Path, logs_map: Iterable[Mapping[str, Any]] | None = None
     root = archive.resolve()
     found: dict[str, LogFile] = {}
     for entry in logs_map or ():
-        for path in sorted(archive.glob(str(entry["glob"]))):
-            _add(found, archive, root, path, str(entry["vehicle"]), str(entry["session"]))
+        for path in sorted(archive.glob(entry.glob)):
+            folders = path.relative_to(archive).parts[:-1] or (path.stem,)
+            _add(found, archive, root, path, entry.vehicle or folders[0], entry.session or folders[-1])
     for vehicle in _folders(archive, root):
         for session in _folders(vehicle, root):
             if log_format(session) is not None and session.relative_to(archive).as_posix() in found:
