@@ -92,7 +92,8 @@ def test_no_flipped_bit_of_the_data_goes_unseen(tmp_path: Path) -> None:
     whole = path.read_bytes()
     rng = np.random.default_rng(3)
     outcomes = set()
-    for bit in rng.integers(0, len(whole) * 8, 200):
+    footer = len(whole) - 8 - int.from_bytes(whole[-8:-4], "little")
+    for bit in [*rng.integers(0, len(whole) * 8, 200), *rng.integers(footer * 8, len(whole) * 8, 300)]:
         torn = bytearray(whole)
         torn[bit // 8] ^= 1 << (bit % 8)
         path.write_bytes(torn)

@@ -1,11 +1,13 @@
 """The recorded sha256 of every file that is kept.
 
-The record is written before the file gets its final name and holds the sha256 of the new content and of what was there
-until then (None: nothing): after a crash between the two, either is what it should be.
+While a file gets its final name the record holds the sha256 of the new content and of what was there until then (None:
+nothing), so that after a crash at that moment either is what it should be; afterwards it holds the new one alone.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from warehouse.errors import disk
@@ -14,10 +16,18 @@ from warehouse.layout import checksum_path
 from warehouse.sealed import BrokenSeal, seal, unseal
 
 
-def record(root: Path, path: Path, sha256: str) -> None:
-    """Record that `path` is about to hold content with this sha256."""
+@contextmanager
+def recording(root: Path, path: Path, sha256: str) -> Iterator[None]:
+    """Record the sha256 that `path` gets within the block."""
     before = file_sha256(path) if path.exists() else None
-    write_bytes(checksum_path(root, path), seal({"sha256": [sha256, before]}))
+    record(root, path, [sha256, before])
+    yield
+    record(root, path, [sha256])
+
+
+def record(root: Path, path: Path, allowed: list[str | None]) -> None:
+    """Record what `path` may hold from now on."""
+    write_bytes(checksum_path(root, path), seal({"sha256": allowed}))
 
 
 def recorded(root: Path, path: Path) -> list[str | None] | None:

@@ -7,15 +7,18 @@ import hashlib
 import os
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Self, TypeAlias
 from uuid import uuid4
 
 from warehouse.errors import disk
 
 TEMPORARY = ".tmp"
 _ABANDONED_AFTER_S = 60.0
+
+AroundRename: TypeAlias = Callable[[str], AbstractContextManager[None]]
 
 
 class AtomicFile:
@@ -27,16 +30,16 @@ class AtomicFile:
     ----------
     path : Path
         Final place.
-    before_rename : callable, optional
-        Called with the sha256 of what was written, after it is safe on disk and before it gets its final name.
+    around_rename : callable, optional
+        Given the sha256 of what was written, safe on disk by then: a context within which it gets its final name.
     """
 
-    def __init__(self, path: Path, before_rename: Callable[[str], None] | None = None) -> None:
+    def __init__(self, path: Path, around_rename: AroundRename | None = None) -> None:
         self.path = path
         self.sha256 = ""
         self.size = 0
         self.closed = False
-        self._before_rename = before_rename
+        self._around_rename = around_rename or _nothing
         self._digest = hashlib.sha256()
         self._temporary = path.with_name(f".{uuid4().hex}{TEMPORARY}")
         with disk(path, "written"):
@@ -69,10 +72,9 @@ class AtomicFile:
         self.sha256 = self._digest.hexdigest()
         with disk(self.path, "written"):
             os.fsync(self._descriptor)
-            if self._before_rename is not None:
-                self._before_rename(self.sha256)
-            os.replace(self._temporary, self.path)
-            sync_folder(self.path.parent)
+            with self._around_rename(self.sha256):
+                os.replace(self._temporary, self.path)
+                sync_folder(self.path.parent)
         self.close()
         return self.sha256
 
@@ -92,9 +94,13 @@ class AtomicFile:
         self.close()
 
 
-def write_bytes(path: Path, data: bytes, before_rename: Callable[[str], None] | None = None) -> str:
+def _nothing(sha256: str) -> AbstractContextManager[None]:
+    return nullcontext()
+
+
+def write_bytes(path: Path, data: bytes, around_rename: AroundRename | None = None) -> str:
     """Write a whole file, atomically and durably; its sha256."""
-    with AtomicFile(path, before_rename) as file:
+    with AtomicFile(path, around_rename) as file:
         file.write(data)
         return file.commit()
 

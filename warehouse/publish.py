@@ -97,7 +97,7 @@ def _replace(root: Path, table: str, vehicle_id: str, new: pl.DataFrame, flights
     after = table_bytes(_sorted(table, pl.concat([kept, new])), table)
     if after == before:
         return False
-    write_bytes(path, after, partial(checksums.record, root, path))
+    write_bytes(path, after, partial(checksums.recording, root, path))
     return True
 
 

@@ -26,7 +26,7 @@ def signal_writer(
     prepare(root)
     path = signal_path(root, table, vehicle_id, flight_id)
     facts = {**(metadata or {}), "fieldcal.vehicle_id": vehicle_id, "fieldcal.flight_id": flight_id}
-    return TableWriter(table, path, units=units, metadata=facts, before_rename=partial(checksums.record, root, path))
+    return TableWriter(table, path, units=units, metadata=facts, around_rename=partial(checksums.recording, root, path))
 
 
 def read_signal(root: Path, table: str, vehicle_id: str, flight_id: str) -> pl.DataFrame:

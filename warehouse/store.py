@@ -7,7 +7,7 @@ both. Floats are dictionary-encoded, time stamps delta-encoded, pages compressed
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 import schemas
 from schemas import SchemaMismatch
 from warehouse.errors import WarehouseError, disk
-from warehouse.files import AtomicFile
+from warehouse.files import AroundRename, AtomicFile
 
 Data: TypeAlias = pl.DataFrame | pa.Table | pa.RecordBatch | Mapping[str, np.ndarray]
 
@@ -41,8 +41,8 @@ class TableWriter:
         The table as a stage writes it.
     units, metadata : mapping, optional
         Real units of logged columns, and facts for the file's metadata (`schemas.arrow_schema`).
-    before_rename : callable, optional
-        Called with the sha256 just before the file gets its final name.
+    around_rename : callable, optional
+        Given the sha256: a context within which the file gets its final name.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class TableWriter:
         stage: bool = False,
         units: Mapping[str, str] | None = None,
         metadata: Mapping[str, str] | None = None,
-        before_rename: Callable[[str], None] | None = None,
+        around_rename: AroundRename | None = None,
     ) -> None:
         self.table = table
         self.path = path
@@ -68,7 +68,7 @@ class TableWriter:
         self.n_rows = 0
         self._stage = stage
         self._schema = schemas.arrow_schema(table, stage=stage, units=units, metadata=metadata)
-        self._file = AtomicFile(path, before_rename)
+        self._file = AtomicFile(path, around_rename)
         try:
             self._parquet = pq.ParquetWriter(self._file, self._schema, **_options(self._schema))
         except BaseException:
@@ -126,10 +126,10 @@ def write_table(
     stage: bool = False,
     units: Mapping[str, str] | None = None,
     metadata: Mapping[str, str] | None = None,
-    before_rename: Callable[[str], None] | None = None,
+    around_rename: AroundRename | None = None,
 ) -> str:
     """Write a whole table, atomically and durably; the sha256 of the file. Parameters as in `TableWriter`."""
-    writer = TableWriter(table, path, stage=stage, units=units, metadata=metadata, before_rename=before_rename)
+    writer = TableWriter(table, path, stage=stage, units=units, metadata=metadata, around_rename=around_rename)
     with writer:
         writer.write(data)
     return writer.sha256
@@ -164,7 +164,9 @@ def read_arrow(source: Path | bytes, table: str, *, stage: bool = False, name: s
     try:
         with pq.ParquetFile(pa.BufferReader(source), page_checksum_verification=True) as file:
             schemas.check(file.schema_arrow, table, stage=stage)
-            return file.read(columns=list(_names(table, stage)))
+            rows = file.read(columns=list(_names(table, stage)))
+            rows.validate(full=True)
+            return rows
     except SchemaMismatch as error:
         raise WarehouseError("schema_mismatch", f"{shown}: {error}.") from error
     except (pa.ArrowException, OSError, ValueError) as error:
@@ -187,8 +189,8 @@ def empty_frame(table: str, *, stage: bool = False) -> pl.DataFrame:
 
 
 def frame(rows: pa.Table) -> pl.DataFrame:
-    """An Arrow table as a polars frame."""
-    result = pl.from_arrow(rows)
+    """An Arrow table as a polars frame; metadata, which polars has no place for, is left behind."""
+    result = pl.from_arrow(pa.Table.from_arrays(rows.columns, names=rows.column_names))
     if not isinstance(result, pl.DataFrame):
         raise TypeError("a table is needed, not a column")
     return result

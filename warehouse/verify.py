@@ -34,7 +34,7 @@ def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path],
     -------
     dict
         `ok`, `files` (how many were checked), `damaged` (a list of `{"path", "reason"}`, paths relative to `root` or
-        `archive`), `content_sha256` (of what `tables/` say; None when a table cannot be read).
+        `archive`), `content_sha256` (of what `tables/` say; None when a file of theirs is damaged).
 
     Raises
     ------
@@ -51,10 +51,8 @@ def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path],
             raise ValueError("log_sha256 is needed to check an archive")
         found += _logs(root, archive, log_sha256)
     damaged = [{"path": path, "reason": reason} for path, reason in found if reason is not None]
-    try:
-        content = content_sha256(root)
-    except WarehouseError:
-        content = None
+    readable = not any(path.startswith("tables/") for path, reason in found if reason is not None)
+    content = content_sha256(root) if readable else None
     return {"ok": not damaged, "files": len(found), "damaged": damaged, "content_sha256": content}
 
 
