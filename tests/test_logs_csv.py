@@ -192,7 +192,7 @@ def test_short_long_damaged_and_wordy_rows_are_counted_with_their_line(tmp_path:
         ("ragged_row", 6),
         ("bad_number", 11),
         ("nul_bytes", 13),
-        ("bad_time", 21),
+        ("bad_time", 11),
         ("incomplete_row", 31),
     ):
         assert f"line {line}." in told[code][1]
@@ -206,6 +206,17 @@ def test_comments_empty_lines_quotes_and_a_repeated_header(tmp_path: Path, table
     frames, summary = read(tmp_path, text)
     table.check(frames)
     assert [(finding.code, finding.loses_data) for finding in summary.findings] == [("repeated_header", False)]
+
+
+def test_quotes_that_do_not_close_cost_their_own_row(tmp_path: Path, table: Table) -> None:
+    lines = table.text().splitlines()
+    lines[3] = '"' + lines[3]
+    lines[7] = lines[7].replace(",", '",', 1)
+    lines[9] = lines[9].replace(",", '","', 1)
+    frames, summary = read(tmp_path, "\n".join(lines) + "\n")
+    kept = [row for row in range(50) if row not in (2, 6, 8)]
+    table.check(frames, kept)
+    assert sum(finding.count for finding in summary.findings if finding.loses_data) == 3
 
 
 def test_a_commented_header_is_a_header(tmp_path: Path, table: Table) -> None:

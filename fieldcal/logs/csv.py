@@ -91,6 +91,7 @@ class CsvTable:
                 lines -= passed
             if not block:
                 continue
+            losses.next_block()
             frame, numbers = read_rows(block, self.dialect, line, self._wanted(), losses)
             if number == 0 and losses.counts.get("ragged_row", 0) > len(numbers):
                 raise UnreadableLog(

@@ -71,8 +71,8 @@ def find_dialect(block: bytes, log_name: str, separator: str | None, decimal: st
     data = [texts[number] for number in body[1:_LINES_LOOKED_AT]]
     found = separator or _separator(texts[place], data)
     names, header, first_row = cells_of(texts[place], found), lines[place], place + 1
-    if found == WHITESPACE:
-        header = b" ".join(header.split())
+    if found == WHITESPACE or QUOTE in texts[place]:
+        header = found.join(names).encode()
     point = _decimal(data, found, decimal)
     if all(is_number(cell.replace(point, ".")) or not cell for cell in names):
         commented = [text for text in texts[:place] if text.lstrip().startswith("#")]

@@ -23,12 +23,19 @@ class Losses:
 
     counts: dict[str, int] = field(default_factory=dict)
     first_lines: dict[str, int] = field(default_factory=dict)
+    _last_lines: dict[str, NDArray[np.int64]] = field(default_factory=dict)
 
     def add(self, reason: str, lines: NDArray[np.int64]) -> None:
-        """Count `lines` (line numbers) under `reason`."""
-        if lines.size:
-            self.counts[reason] = self.counts.get(reason, 0) + int(lines.size)
-            self.first_lines.setdefault(reason, int(lines.min()))
+        """Count `lines` (line numbers) under `reason`; a line that several tables lose counts once."""
+        new = np.setdiff1d(lines, self._last_lines.get(reason, lines[:0]))
+        if new.size:
+            self.counts[reason] = self.counts.get(reason, 0) + int(new.size)
+            self.first_lines[reason] = min(int(new[0]), self.first_lines.get(reason, int(new[0])))
+            self._last_lines[reason] = np.union1d(self._last_lines.get(reason, new), new)
+
+    def next_block(self) -> None:
+        """The lines to come are others than those met so far."""
+        self._last_lines.clear()
 
 
 def read_rows(
@@ -41,11 +48,13 @@ def read_rows(
     """
     if dialect.separator == WHITESPACE:
         block = re.sub(rb"(?m)^ | $", b"", re.sub(rb"[ \t]+", b" ", block))
+    block, unclosed = _unquoted(block, dialect.separator)
     data = np.frombuffer(block, np.uint8)
     ends = np.flatnonzero(data == _LINE_FEED)
     starts = np.concatenate(([0], ends[:-1] + 1))
     numbers = first_line + np.arange(len(ends), dtype=np.int64)
-    fields = _fields(block, data, starts, ends, dialect.separator)
+    fields = np.bincount(np.searchsorted(ends, np.flatnonzero(data == ord(dialect.separator))), minlength=len(ends)) + 1
+    fields[unclosed] = 0
     silent = _silent(block, data, starts, ends, dialect, numbers, losses)
     damaged = np.zeros(len(ends), bool)
     damaged[np.searchsorted(ends, np.flatnonzero(data == 0))] = True
@@ -73,20 +82,26 @@ def numbers_of(cells: pl.Series) -> tuple[NDArray[np.float64], NDArray[np.bool_]
     return np.where(np.isfinite(numbers), numbers, np.nan), bad
 
 
-def _fields(
-    block: bytes, data: NDArray[np.uint8], starts: NDArray[np.intp], ends: NDArray[np.intp], separator: str
-) -> NDArray[np.int64]:
-    """Number of fields of each line; 0 for one whose quotes do not close."""
-    separators = np.flatnonzero(data == ord(separator))
-    fields = np.bincount(np.searchsorted(ends, separators), minlength=len(ends)) + 1
-    quotes = np.flatnonzero(data == ord(QUOTE))
-    if quotes.size:
-        per_line = np.bincount(np.searchsorted(ends, quotes), minlength=len(ends))
-        for line in np.flatnonzero(per_line).tolist():
-            text = block[starts[line] : ends[line]].decode("utf-8", "replace")
-            odd = per_line[line] % 2 == 1
-            fields[line] = 0 if odd else len(next(csv.reader([text], delimiter=separator), []))
-    return fields.astype(np.int64)
+def _unquoted(block: bytes, separator: str) -> tuple[bytes, list[int]]:
+    """The block with quotes resolved, and the positions of lines whose quotes do not close.
+
+    A separator inside quotes becomes a space: quoted cells are words, which are not read.
+    """
+    if QUOTE.encode() not in block:
+        return block, []
+    lines = block.split(b"\n")
+    unclosed = []
+    for number, line in enumerate(lines):
+        if QUOTE.encode() not in line:
+            continue
+        try:
+            cells = next(csv.reader([line.decode("utf-8", "surrogateescape")], delimiter=separator, strict=True))
+        except csv.Error:
+            unclosed.append(number)
+            continue
+        text = separator.join(cell.replace(separator, " ").replace("\n", " ") for cell in cells)
+        lines[number] = text.encode("utf-8", "surrogateescape")
+    return b"\n".join(lines), unclosed
 
 
 def _silent(
@@ -114,23 +129,15 @@ def _cells(block: bytes, dialect: Dialect, columns: Sequence[int], rows: int) ->
     order = sorted(set(columns))
     if not rows:
         return pl.DataFrame(schema={str(column): pl.String for column in order})
-    quoted = QUOTE.encode() in block
-    frame = _parsed(block, dialect, order, QUOTE if quoted else None)
-    if quoted and frame.height != rows:
-        frame = _parsed(block, dialect, order, None).select(pl.all().str.strip_chars(QUOTE))
-    return frame
-
-
-def _parsed(block: bytes, dialect: Dialect, columns: list[int], quote: str | None) -> pl.DataFrame:
     frame = pl.read_csv(
         block,
         has_header=False,
         separator=dialect.separator,
-        columns=columns,
+        columns=order,
         infer_schema=False,
-        quote_char=quote,
+        quote_char=None,
         encoding="utf8-lossy",
         truncate_ragged_lines=True,
     )
-    frame.columns = [str(column) for column in columns]
+    frame.columns = [str(column) for column in order]
     return frame

@@ -64,9 +64,9 @@ def find_logs(archive: Path, logs_map: Iterable[LogsEntry] | None = None) -> lis
     archive : Path
         Root of the archive: `ARCHIVE/<vehicle_id>/<session_id>/<log>`.
     logs_map : iterable of LogsEntry, optional
-        For archives of another shape (`Configuration.logs`). A log matched here takes vehicle and session from the first
-        entry that matches; where an entry leaves one open, from the outermost and the innermost folder that the log
-        lies in, or from its own name when it lies in none.
+        For archives of another shape (`Configuration.logs`). A log matched here takes vehicle and session from the
+        first entry that matches; where an entry leaves one open, from the outermost and the innermost folder that the
+        log lies in, or from its own name when it lies in none.
 
     Notes
     -----

@@ -155,4 +155,6 @@ def _walk(view: memoryview, position: int, limit: int, found: array[int], others
 def _merged(starts: NDArray[np.int64], found: array[int]) -> NDArray[np.int64]:
     if not found:
         return starts
+    if not starts.size:
+        return np.frombuffer(found, np.int64)
     return np.sort(np.concatenate((starts, np.frombuffer(found, np.int64))))

@@ -34,7 +34,6 @@ from fieldcal.logs.mcap_records import (
     MESSAGE_INDEX,
     METADATA,
     SCHEMA,
-    STATISTICS,
     ChunkHead,
     Damage,
     Fields,
@@ -48,13 +47,13 @@ from fieldcal.logs.mcap_records import (
     read_metadata,
     read_record,
     read_schema,
-    read_statistics,
 )
 from fieldcal.logs.mcap_report import Definitions, Tally
+from fieldcal.logs.mcap_summary import ends_whole, read_summary
 
-TOTAL_CAP_BYTES = 1 << 30
-TOTAL_CAP_RATIO = 200
-"""A file may decompress to 1 GiB, or to 200 times its own size when that is more."""
+TOTAL_CAP_BYTES = 512 << 20
+TOTAL_CAP_RATIO = 64
+"""A file may decompress to 512 MiB, or to 64 times its own size when that is more (real logs: 2 to 15 times)."""
 
 MESSAGES_AT_ONCE = 1 << 16
 LOOSE_BYTES = 4 << 20
@@ -105,11 +104,11 @@ class McapFile:
         self._released = 0
         self._limit = self.size
         self._data_end: int | None = None
-        self._has_end = self.buffer[-len(MAGIC) :] == MAGIC and self.size >= 2 * len(MAGIC) + FOOTER_BYTES
+        self._has_end = ends_whole(self.buffer)
         self.has_summary = False
         if self._has_end:
             self._limit = self.size - len(MAGIC) - FOOTER_BYTES
-            self._read_summary()
+            self._adopt_summary()
         if self.buffer[: len(MAGIC)] != MAGIC:
             self._begin = self._next_chunk(0)
             if self._begin is None:
@@ -120,6 +119,18 @@ class McapFile:
             self.tally.damaged_records.append((0, "the file does not begin with MCAP's magic bytes"))
         else:
             self._begin = len(MAGIC)
+
+    def _adopt_summary(self) -> None:
+        try:
+            summary = read_summary(self.buffer)
+        except Damage as damage:
+            self.tally.summary_damage = str(damage)
+            return
+        if summary is not None:
+            self.definitions, self.statistics = summary.definitions, summary.statistics
+            self._limit = summary.start
+            self._data_end = summary.start - DATA_END_BYTES
+            self.has_summary = True
 
     def blocks(self) -> Generator[Block]:
         """The messages of every intact stretch, in file order. Definitions and the tally grow on the way."""
@@ -366,44 +377,6 @@ class McapFile:
             channel_id = int.from_bytes(self.buffer[record.body : record.body + 2], "little")
             return record.end if channel_id in self.definitions.channels else None
         return record.end
-
-    def _read_summary(self) -> None:
-        """Definitions and statistics from the summary section, if its CRC holds."""
-        footer = self.size - len(MAGIC) - FOOTER_BYTES
-        try:
-            record = read_record(self.buffer, footer, footer + FOOTER_BYTES)
-            check_record(self.buffer, record)
-            fields = Fields(self.buffer, record.body, record.end)
-            start, _, crc = fields.number(8), fields.number(8), fields.number(4)
-            if record.opcode != FOOTER:
-                raise Damage("the file does not end with a footer")
-            if start == 0:
-                return
-            if not len(MAGIC) + DATA_END_BYTES <= start <= footer:
-                raise Damage(f"the footer places the summary at byte {start}")
-            if crc and zlib.crc32(self.buffer[start : footer + FOOTER_BYTES - 4]) != crc:
-                raise Damage("the summary's CRC does not match")
-            self._read_summary_records(start, footer)
-        except Damage as damage:
-            self.tally.summary_damage = str(damage)
-            return
-        self._limit = start
-        self._data_end = start - DATA_END_BYTES
-        self.has_summary = True
-
-    def _read_summary_records(self, position: int, limit: int) -> None:
-        definitions, statistics = Definitions(), None
-        while position < limit:
-            record = read_record(self.buffer, position, limit)
-            fields = Fields(self.buffer, record.body, record.end)
-            if record.opcode == SCHEMA:
-                definitions.add(read_schema(fields))
-            elif record.opcode == CHANNEL:
-                definitions.add(read_channel(fields))
-            elif record.opcode == STATISTICS:
-                statistics = read_statistics(fields)
-            position = record.end
-        self.definitions, self.statistics = definitions, statistics
 
 
 def _map(path: Path) -> mmap.mmap:

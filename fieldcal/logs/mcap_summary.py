@@ -1,0 +1,72 @@
+"""The summary section at the end of an MCAP file: definitions and statistics, believed when its CRC holds."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field
+
+from fieldcal.logs.mcap_records import (
+    CHANNEL,
+    DATA_END_BYTES,
+    FOOTER,
+    FOOTER_BYTES,
+    MAGIC,
+    SCHEMA,
+    STATISTICS,
+    Buffer,
+    Damage,
+    Fields,
+    Statistics,
+    check_record,
+    read_channel,
+    read_record,
+    read_schema,
+    read_statistics,
+)
+from fieldcal.logs.mcap_report import Definitions
+
+_CRC_BYTES = 4
+
+
+@dataclass
+class Summary:
+    """A summary section that begins at byte `start`."""
+
+    start: int
+    definitions: Definitions = field(default_factory=Definitions)
+    statistics: Statistics | None = None
+
+
+def ends_whole(buffer: Buffer) -> bool:
+    """Whether a file ends with MCAP's magic bytes and has room for a footer before them."""
+    size = len(buffer)
+    return size >= 2 * len(MAGIC) + FOOTER_BYTES and bytes(buffer[size - len(MAGIC) : size]) == MAGIC
+
+
+def read_summary(buffer: Buffer) -> Summary | None:
+    """The summary of a file that ends whole; None when its footer says that there is none. Raises Damage."""
+    footer = len(buffer) - len(MAGIC) - FOOTER_BYTES
+    record = read_record(buffer, footer, footer + FOOTER_BYTES)
+    check_record(buffer, record)
+    if record.opcode != FOOTER:
+        raise Damage("the file does not end with a footer")
+    fields = Fields(buffer, record.body, record.end)
+    start, _, crc = fields.number(8), fields.number(8), fields.number(4)
+    if start == 0:
+        return None
+    if not len(MAGIC) + DATA_END_BYTES <= start <= footer:
+        raise Damage(f"the footer places the summary at byte {start}")
+    if crc and zlib.crc32(buffer[start : footer + FOOTER_BYTES - _CRC_BYTES]) != crc:
+        raise Damage("the summary's CRC does not match")
+    summary, position = Summary(start), start
+    while position < footer:
+        record = read_record(buffer, position, footer)
+        fields = Fields(buffer, record.body, record.end)
+        if record.opcode == SCHEMA:
+            summary.definitions.add(read_schema(fields))
+        elif record.opcode == CHANNEL:
+            summary.definitions.add(read_channel(fields))
+        elif record.opcode == STATISTICS:
+            summary.statistics = read_statistics(fields)
+        position = record.end
+    return summary
