@@ -14,9 +14,8 @@ from fieldcal.logs.interface import SENSORS, Batch, Columns, LogSummary, Vehicle
 from fieldcal.logs.mcap_file import Block, McapFile
 from fieldcal.logs.mcap_records import HEAD_BYTES, MESSAGE_HEAD_BYTES, gather
 from fieldcal.logs.mcap_report import Definitions, report
-from fieldcal.logs.mcap_roles import RAW_IMU, SI_TYPES, Source, choose_sources
+from fieldcal.logs.mcap_roles import METADATA_NAME, SI_TYPES, Source, choose_sources
 
-METADATA_NAME = "fieldcal"
 SI_UNITS = {"gyroscope": "rad/s", "accelerometer": "m/s^2", "magnetometer": "T"}
 _U2, _U8 = np.dtype("<u2"), np.dtype("<u8")
 
@@ -180,6 +179,3 @@ def _finite(table: str, columns: Columns) -> Iterator[Batch]:
         yield table, columns
     elif whole.any():
         yield table, {name: values[whole] for name, values in columns.items()}
-
-
-__all__ = ["METADATA_NAME", "RAW_IMU", "McapLog"]

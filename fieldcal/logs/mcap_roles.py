@@ -17,6 +17,7 @@ from fieldcal.logs.ros2_cdr import CdrDecoder
 from fieldcal.logs.ros2_definitions import short_name
 
 RAW_IMU = "fieldcal_msgs/RawImu"
+METADATA_NAME = "fieldcal"
 
 _POSITION = {
     "latitude_deg": Want.of("latitude", 1),

@@ -23,10 +23,9 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import ArrayLike, NDArray
 
 from fieldcal.logs.decoded import COMPONENTS, NANOSECONDS
-from fieldcal.logs.mcap_roles import RAW_IMU
+from fieldcal.logs.mcap_roles import METADATA_NAME, RAW_IMU
 from fieldcal.logs.ros2_definitions import Numbers, Text, flatten, full_text
 
-METADATA_NAME = "fieldcal"
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 ENCODINGS = ("cdr", "json")
 
