@@ -88,7 +88,7 @@ def test_a_damaged_output_is_not_loaded(tmp_path: Path) -> None:
 
 def test_a_failed_save_is_not_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stages, _ = saved(tmp_path)
-    monkeypatch.setattr("warehouse.stage_store.write_bytes", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr("warehouse.stage_store.write_bytes", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         saved(tmp_path)
     assert stages.complete(*WHERE) is None

@@ -198,3 +198,27 @@ def test_files_being_written_are_not_cleared_away(tmp_path: Path) -> None:
     assert (tmp_path / "data").read_bytes() == b"x"
     with pytest.raises(ValueError, match="no longer being written"):
         file.write(b"y")
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="names of descriptors are read from /proc")
+@pytest.mark.parametrize("durable", [True, False])
+def test_files_and_folders_are_forced_to_disk_before_they_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, durable: bool
+) -> None:
+    """File, then its new folders and name; the rename comes after the file's own fsync."""
+    done: list[str] = []
+    fsync, replace = os.fsync, os.replace
+
+    def seen_fsync(descriptor: int) -> None:
+        done.append("fsync " + os.readlink(f"/proc/self/fd/{descriptor}").rpartition("/")[2].rpartition(".")[2])
+        fsync(descriptor)
+
+    def seen_replace(source: Path, target: Path) -> None:
+        done.append("rename")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", seen_fsync)
+    monkeypatch.setattr(os, "replace", seen_replace)
+    write_bytes(tmp_path / "new" / "data", b"x", durable=durable)
+    parent = f"fsync {tmp_path.name}"
+    assert done == ([parent, "fsync tmp", "rename", "fsync new"] if durable else ["rename"])

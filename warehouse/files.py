@@ -32,18 +32,22 @@ class AtomicFile:
         Final place.
     around_rename : callable, optional
         Given the sha256 of what was written, safe on disk by then: a context within which it gets its final name.
+    durable : bool
+        False: still whole or absent when a process dies, but after a power cut the file may be torn; for what is
+        checked before it is used and can be made again.
     """
 
-    def __init__(self, path: Path, around_rename: AroundRename | None = None) -> None:
+    def __init__(self, path: Path, around_rename: AroundRename | None = None, *, durable: bool = True) -> None:
         self.path = path
         self.sha256 = ""
         self.size = 0
         self.closed = False
+        self._durable = durable
         self._around_rename = around_rename or _nothing
         self._digest = hashlib.sha256()
         self._temporary = path.with_name(f".{uuid4().hex}{TEMPORARY}")
         with disk(path, "written"):
-            make_folder(path.parent)
+            make_folder(path.parent, durable=durable)
             self._descriptor = os.open(self._temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
             fcntl.flock(self._descriptor, fcntl.LOCK_EX)
 
@@ -68,13 +72,15 @@ class AtomicFile:
         """Part of the file interface; `commit` is what makes it durable."""
 
     def commit(self) -> str:
-        """Put the file in its final place, durably; its sha256."""
+        """Put the file in its final place; its sha256."""
         self.sha256 = self._digest.hexdigest()
         with disk(self.path, "written"):
-            os.fsync(self._descriptor)
+            if self._durable:
+                os.fsync(self._descriptor)
             with self._around_rename(self.sha256):
                 os.replace(self._temporary, self.path)
-                sync_folder(self.path.parent)
+                if self._durable:
+                    sync_folder(self.path.parent)
         self.close()
         return self.sha256
 
@@ -98,20 +104,21 @@ def _nothing(sha256: str) -> AbstractContextManager[None]:
     return nullcontext()
 
 
-def write_bytes(path: Path, data: bytes, around_rename: AroundRename | None = None) -> str:
-    """Write a whole file, atomically and durably; its sha256."""
-    with AtomicFile(path, around_rename) as file:
+def write_bytes(path: Path, data: bytes, around_rename: AroundRename | None = None, *, durable: bool = True) -> str:
+    """Write a whole file, atomically and durably; its sha256. Parameters as in `AtomicFile`."""
+    with AtomicFile(path, around_rename, durable=durable) as file:
         file.write(data)
         return file.commit()
 
 
-def make_folder(folder: Path) -> None:
-    """Make a folder and those above it, each safe on disk."""
+def make_folder(folder: Path, *, durable: bool = True) -> None:
+    """Make a folder and those above it, each (if `durable`) safe on disk."""
     if folder.is_dir():
         return
-    make_folder(folder.parent)
+    make_folder(folder.parent, durable=durable)
     folder.mkdir(exist_ok=True)
-    sync_folder(folder.parent)
+    if durable:
+        sync_folder(folder.parent)
 
 
 def sync_folder(folder: Path) -> None:

@@ -43,6 +43,8 @@ class TableWriter:
         Real units of logged columns, and facts for the file's metadata (`schemas.arrow_schema`).
     around_rename : callable, optional
         Given the sha256: a context within which the file gets its final name.
+    durable : bool
+        False: not forced to disk (`warehouse.files.AtomicFile`).
 
     Attributes
     ----------
@@ -61,6 +63,7 @@ class TableWriter:
         units: Mapping[str, str] | None = None,
         metadata: Mapping[str, str] | None = None,
         around_rename: AroundRename | None = None,
+        durable: bool = True,
     ) -> None:
         self.table = table
         self.path = path
@@ -68,7 +71,7 @@ class TableWriter:
         self.n_rows = 0
         self._stage = stage
         self._schema = schemas.arrow_schema(table, stage=stage, units=units, metadata=metadata)
-        self._file = AtomicFile(path, around_rename)
+        self._file = AtomicFile(path, around_rename, durable=durable)
         try:
             self._parquet = pq.ParquetWriter(self._file, self._schema, **_options(self._schema))
         except BaseException:
@@ -127,9 +130,12 @@ def write_table(
     units: Mapping[str, str] | None = None,
     metadata: Mapping[str, str] | None = None,
     around_rename: AroundRename | None = None,
+    durable: bool = True,
 ) -> str:
-    """Write a whole table, atomically and durably; the sha256 of the file. Parameters as in `TableWriter`."""
-    writer = TableWriter(table, path, stage=stage, units=units, metadata=metadata, around_rename=around_rename)
+    """Write a whole table, atomically; the sha256 of the file. Parameters as in `TableWriter`."""
+    writer = TableWriter(
+        table, path, stage=stage, units=units, metadata=metadata, around_rename=around_rename, durable=durable
+    )
     with writer:
         writer.write(data)
     return writer.sha256
