@@ -19,7 +19,8 @@ CHUNK = 4096  # samples worked on at a time: what the processor's cache holds
 
 @dataclass(frozen=True)
 class AttitudeFit:
-    """Attitudes `q` (n, 4), their fit statistic `taste` (n,) and standard deviation `sd` (n,), rad, root of the trace of P."""
+    """Attitudes `q` (n, 4), their fit statistic `taste` (n,) and standard deviation `sd` (n,), rad, root of the
+    trace of P."""
 
     q: Array
     taste: Array
@@ -144,7 +145,8 @@ def _profile(b: Array, wr: Array) -> Array:
 def _quest_chunk(profile: Array, out: Array) -> None:
     """One cache-sized chunk of `quest`; profile B (3, 3, n), result into out (n, 4)."""
     x, gamma, derivative, lam = _quest_solution(profile)
-    # γ/|ψ′(λ)| is δ²: the same quantity of the frame turned by 180° about axis i is ε_i². Where δ² is small use the largest.
+    # γ/|ψ′(λ)| is δ²: the same quantity of the frame turned by 180° about axis i is ε_i². Where δ² is small use the
+    # largest.
     weak = np.flatnonzero(np.abs(gamma) < 0.1 * np.abs(derivative))
     out[:, 0], out[:, 1], out[:, 2], out[:, 3] = x[0], x[1], x[2], gamma
     if len(weak):

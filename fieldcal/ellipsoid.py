@@ -16,7 +16,13 @@ from numpy.typing import ArrayLike
 
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.rotation import Array
-from fieldcal.statistics import huber_weights, least_squares_covariance, robust_sigma
+from fieldcal.statistics import (
+    huber_inflation,
+    huber_weights,
+    least_squares_covariance,
+    robust_sigma,
+    white_noise_sigma,
+)
 
 # Li and Griffiths' constraint 4J − I² > 0 on (θ1, θ2, θ3), and its inverse.
 C1 = np.array([[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0]])
@@ -28,8 +34,8 @@ class TriadFit:
     """A triad's calibration z = Λ z_d + b and what is known of it.
 
     `scale` (3, 3) is Λ, diagonal but for `li_full`, polarity included; `bias` (3,) in the field's unit. `covariance`
-    (6, 6) of (λx, λy, λz, bx, by, bz), coloured-residual form; `covariance_white` its Cramér–Rao form. `residual_rms` is
-    the rms of |z|/f − 1. `condition` is that of the column-normalised Jacobian; `share_used` the mean robust weight.
+    (6, 6) of (λx, λy, λz, bx, by, bz), coloured-residual form; `covariance_white` its Cramér–Rao form. `residual_rms`
+    is the rms of |z|/f − 1. `condition` is that of the column-normalised Jacobian; `share_used` the mean robust weight.
     """
 
     scale: Array
@@ -120,13 +126,24 @@ def fit_ellipsoid(
         raise ValueError(f"method is one of {', '.join(METHODS)}, not {method!r}")
     # Shift by the mean and divide by one common standard deviation: the constraint is not invariant to scaling by axis.
     centre = z.mean(axis=0)
-    spread = float(np.sqrt(np.mean((z - centre) ** 2)))
-    if spread == 0.0:
+    spread = float(np.sqrt(np.mean((z - centre) ** 2))) * (_noise_shape(z) if method == "robust" else np.ones(3))
+    if not (spread > 0.0).all():
         raise UnusableFlight("ellipsoid_degenerate", "All readings are the same: the sensor is stuck or was not moved.")
     x = (z - centre) / spread
     scale, bias, weight, iterations = METHODS[method](x)
     fit = _with_statistics(x, scale, bias, weight, iterations)
     return _in_logged_units(fit, centre, spread, magnitude, np.asarray(polarity, dtype=float))
+
+
+def _noise_shape(z: Array) -> Array:
+    """Relative noise of the three axes in logged units, (3,), mean square 1: least distances want it the same on each.
+
+    Axes of one triad differ when their scales do. Where differences say little (a quantised or unordered record) all
+    1."""
+    sigma = white_noise_sigma(z)
+    if not (sigma > 0).all() or sigma.max() > 5.0 * sigma.min():
+        return np.ones(3)
+    return sigma / np.sqrt(np.mean(sigma**2))
 
 
 Solution = tuple[Array, Array, Array, int]  # Λ (3, 3), b (3,) for unit radius; robust weights (n,); iterations
@@ -144,7 +161,7 @@ def _quadric_to_triad(theta: Array, offset: float) -> tuple[Array, Array]:
     if lengths[0] <= 1e-12 * lengths[2]:
         raise UnusableFlight(
             "ellipsoid_degenerate",
-            "The readings lie on a plane or an open surface, not an ellipsoid: turn the vehicle through more attitudes.",
+            "The readings lie on a plane or an open surface, not an ellipsoid: turn through more attitudes.",
             {"quadric_eigenvalues": [float(v) for v in lengths]},
         )
     to_centre = np.linalg.solve(q, p)
@@ -225,60 +242,91 @@ def _sphere(x: Array) -> Solution:
     return np.eye(3) / radius, -t[:3] / radius, np.ones(len(x)), 1
 
 
-def _residuals(x: Array, scale: Array, bias: Array, sigma: float = 0.0) -> tuple[Array, Array]:
-    """Distance of each reading from the ellipsoid, in logged units (n,), and its gradient over (λ, b), (n, 6).
+# Clipping Gaussian residuals would cost 5 % of the information for nothing: robust weights are for records with more
+# than this share of residuals beyond 3σ (Gaussian: 0.0027).
+GAUSSIAN_TAIL = 0.006
+# The noise term of the distances is held fixed in the gradient, so the solution lies this little above the least cost.
+SLACK = 1e-4
 
-    r = (n − 1)/‖Λu‖ with h = Λx + b, n = ‖h‖, u = h/n; ∂r = [u∘x̂, u]/‖Λu‖ at the reading's foot x̂ = x − r Λu/‖Λu‖.
+
+@dataclass(frozen=True)
+class _Distances:
+    """Of readings from an ellipsoid, kept column by column (3, n) for speed: r (n,), u, Λu and ‖Λu‖ at each."""
+
+    residual: Array
+    u: Array
+    lu: Array
+    divisor: Array
+
+    def jacobian(self, x: Array) -> Array:
+        """∂r/∂(λ, b), (6, n): [u∘x̂, u]/‖Λu‖ at the reading's foot x̂ = x − r Λu/‖Λu‖."""
+        out = np.empty((6, x.shape[1]))
+        np.divide(self.u, self.divisor, out=out[3:])
+        np.multiply(out[3:], x - (self.residual / self.divisor) * self.lu, out=out[:3])
+        return out
+
+
+def _distances(x: Array, scale: Array, bias: Array, sigma: float = 0.0) -> _Distances:
+    """r = (n − 1)/‖Λu‖ in logged units, h = Λx + b, n = ‖h‖, u = h/n, for columns x (3, n).
+
     The division by ‖Λu‖ is what keeps Λ → 0 from being a perfect fit. Noise `sigma` (logged units) across u makes n too
     long by σ²(‖Λ‖² − ‖Λu‖²)/2n on average: taken off."""
-    h = x @ scale.T + bias
-    norm = np.sqrt(np.einsum("ij,ij->i", h, h))
-    u = h / norm[:, None]
-    lu = u @ scale
-    divisor = np.sqrt(np.einsum("ij,ij->i", lu, lu))
+    h = scale @ x + bias[:, None]
+    norm = np.sqrt(h[0] * h[0] + h[1] * h[1] + h[2] * h[2])
+    u = h / norm
+    lu = scale.T @ u
+    divisor = np.sqrt(lu[0] * lu[0] + lu[1] * lu[1] + lu[2] * lu[2])
     residual = (norm - 1.0) / divisor
-    foot = x - (residual / divisor)[:, None] * lu
-    jacobian = np.empty((len(x), 6))
-    jacobian[:, 3:] = u / divisor[:, None]
-    jacobian[:, :3] = jacobian[:, 3:] * foot
     if sigma > 0.0:
-        residual = residual - 0.5 * sigma**2 * (np.sum(scale**2) / divisor - divisor) / norm
-    return residual, jacobian
+        residual -= 0.5 * sigma**2 * (np.sum(scale**2) / divisor - divisor) / norm
+    return _Distances(residual, u, lu, divisor)
 
 
-def _gauss_newton(x: Array, scale: Array, bias: Array, *, robust: bool, max_iterations: int = 50) -> Solution:
+def _gauss_newton(rows: Array, scale: Array, bias: Array, *, robust: bool, max_iterations: int = 50) -> Solution:
     """Least distances from a start by Levenberg–Marquardt; robust weights and noise level are renewed at every step."""
+    x = np.ascontiguousarray(rows.T)
     diagonal = np.abs(np.diagonal(scale)).copy()
     bias = np.array(bias, dtype=float)
-    weight, sigma, damping = np.ones(len(x)), 0.0, 0.0
+    weight: Array = np.ones(x.shape[1])
+    sigma, damping, tailed = 0.0, 0.0, False
+    at = _distances(x, np.diag(diagonal), bias)
     for iteration in range(1, max_iterations + 1):
-        residual, jacobian = _residuals(x, np.diag(diagonal), bias, sigma)
         if robust:
-            sigma = robust_sigma(residual)
-            weight = huber_weights(residual, sigma)
-        weighted = jacobian * weight[:, None]
-        normal, gradient = weighted.T @ jacobian, weighted.T @ residual
-        cost = float(np.sum(weight * residual**2))
+            sigma = robust_sigma(at.residual)
+            if iteration <= 3:
+                tailed = float(np.mean(np.abs(at.residual) > 3.0 * sigma)) > GAUSSIAN_TAIL
+            if tailed:
+                weight = huber_weights(at.residual, sigma)
+            at = _distances(x, np.diag(diagonal), bias, sigma)
+        jacobian = at.jacobian(x)
+        weighted = jacobian * weight
+        normal, gradient = weighted @ jacobian.T, weighted @ at.residual
+        cost = float(weight @ at.residual**2)
         for _ in range(12):
             damped = normal + damping * np.diag(np.diagonal(normal))
             step = np.linalg.lstsq(damped, -gradient, rcond=1e-15)[0]
             trial, trial_bias = diagonal + step[:3], bias + step[3:]
             if (trial > 0.3 * diagonal).all():
-                after, _ = _residuals(x, np.diag(trial), trial_bias, sigma)
-                if float(np.sum(weight * after**2)) <= cost * (1 + 1e-9) + 1e-24:
+                after = _distances(x, np.diag(trial), trial_bias, sigma)
+                if float(weight @ after.residual**2) <= cost * (1 + SLACK) + 1e-24:
                     damping *= 0.1
+                    at = after
                     break
             damping = max(10.0 * damping, 1e-6)
+        else:
+            break  # no direction lowers the cost
         diagonal, bias = trial, trial_bias
         size = float(np.max(np.abs(np.concatenate([step[:3] / diagonal, step[3:]]))))
         if not np.isfinite(size) or diagonal.max() > 1e6 or diagonal.min() < 1e-9:
             break
-        if size < 1e-9 or (robust and sigma > 0 and size < 1e-6):
+        # Well inside what noise moves: sigma over the square root of the sample count.
+        if size < max(1e-9, 1e-3 * sigma / np.sqrt(x.shape[1])):
             return np.diag(diagonal), bias, weight, iteration
     raise EstimationError(
         "ellipsoid_diverged",
-        "The ellipsoid refinement found no minimum: too little of the sphere was seen.",
-        {"iterations": iteration},
+        "The ellipsoid refinement found no minimum: too little of the sphere was seen, or other accelerations or fields"
+        " drown the curvature.",
+        {"iterations": iteration, "residual_rms_relative": float(np.sqrt(np.mean((at.residual * at.divisor) ** 2)))},
     )
 
 
@@ -291,20 +339,22 @@ METHODS: dict[str, Callable[[Array], Solution]] = {
 }
 
 
-def _with_statistics(x: Array, scale: Array, bias: Array, weight: Array, iterations: int) -> TriadFit:
-    """Covariance at the solution, in the shifted and scaled coordinates. Cross terms of `li_full` are taken as known."""
-    residual, jacobian = _residuals(x, scale, bias)
-    root = np.sqrt(weight)[:, None]
-    white, coloured = least_squares_covariance((jacobian * root)[:, None, :], (residual[:, None] * root))
-    norm = np.linalg.norm(x @ scale.T + bias, axis=1)
+def _with_statistics(rows: Array, scale: Array, bias: Array, weight: Array, iterations: int) -> TriadFit:
+    """Covariance at the solution, in scaled coordinates. Cross terms of `li_full` are taken as known."""
+    x = np.ascontiguousarray(rows.T)
+    at = _distances(x, scale, bias)
+    root = np.sqrt(weight)
+    sensitivity = (at.jacobian(x) * root).T
+    white, coloured = least_squares_covariance(sensitivity[:, None, :], (at.residual * root)[:, None])
+    inflation = huber_inflation(weight)
     return TriadFit(
         scale=scale,
         bias=bias,
-        covariance=coloured,
+        covariance=coloured * inflation,
         covariance_white=white,
-        residual_rms=float(np.sqrt(np.mean((norm - 1.0) ** 2))),
-        condition=direction_condition(x @ scale.T + bias),
-        n_samples=len(x),
+        residual_rms=float(np.sqrt(np.mean((at.residual * at.divisor) ** 2))),
+        condition=direction_condition(at.u.T),
+        n_samples=len(rows),
         share_used=float(weight.mean()),
         iterations=iterations,
     )
@@ -325,14 +375,14 @@ def direction_condition(vectors: ArrayLike) -> float:
     return float(np.sqrt(eigenvalues[-1] / eigenvalues[0])) if eigenvalues[0] > 0 else float("inf")
 
 
-def _in_logged_units(fit: TriadFit, centre: Array, spread: float, magnitude: float, polarity: Array) -> TriadFit:
+def _in_logged_units(fit: TriadFit, centre: Array, spread: Array, magnitude: float, polarity: Array) -> TriadFit:
     """From x = (z − centre)/spread and unit radius to logged units and radius f, polarity put in."""
     sign = np.diag(polarity)
-    scale = sign @ fit.scale * (magnitude / spread)
+    scale = sign @ fit.scale * (magnitude / spread)  # column j of Λ works on axis j
     bias = sign @ fit.bias * magnitude - scale @ centre
     # (λ, b) = T (λ', b'): λ = s λ' f/spread, b = s f b' − λ centre
     transform = np.zeros((6, 6))
-    transform[:3, :3] = sign * (magnitude / spread)
+    transform[:3, :3] = sign @ np.diag(magnitude / spread)
     transform[3:, 3:] = sign * magnitude
     transform[3:, :3] = -np.diag(centre) @ transform[:3, :3]
     return replace(
@@ -354,8 +404,8 @@ def require_determined(
 ) -> None:
     """Refuse a calibration that the recording does not determine.
 
-    Checks, all four: condition number, claimed relative sd of the scales, rms of |z|/f − 1, and (where a nominal scale is
-    known) each scale within a factor of two of it. At a collapsed solution any one of them alone can look healthy.
+    Checks, all four: condition number, claimed relative sd of the scales, rms of |z|/f − 1, and (where a nominal scale
+    is known) each scale within a factor of two of it. At a collapsed solution any one of them alone can look healthy.
 
     Raises
     ------
@@ -377,8 +427,8 @@ def require_determined(
         if (ratio < 0.5).any() or (ratio > 2.0).any():
             raise UnusableFlight(
                 "scale_not_nominal",
-                f"A scale is {ratio.min():.3g} to {ratio.max():.3g} times its nominal value, outside 0.5 to 2: wrong unit,"
-                " wrong field strength, or a collapsed fit.",
+                f"A scale is {ratio.min():.3g} to {ratio.max():.3g} times its nominal value, outside 0.5 to 2: wrong"
+                " unit, wrong field strength, or a collapsed fit.",
                 measured,
             )
     if not relative <= max_scale_sd:

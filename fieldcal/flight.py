@@ -106,14 +106,5 @@ def _nominal_scale(vehicle: Vehicle, sensor: str, unit: str, field_unit: str) ->
 
 
 def _reference_reading(vehicle: Vehicle, sensor: str) -> list[float] | None:
-    """d0 of `zero_bias`: as configured; None leaves it to the readings' format (see `default_reference_reading`)."""
+    """d0 of `zero_bias`: as configured; None leaves it to the readings' format (`sensor.default_reference_reading`)."""
     return list(vehicle.reference_reading[sensor]) if sensor in vehicle.reference_reading else None
-
-
-def default_reference_reading(logged: np.ndarray, unit: str) -> np.ndarray:
-    """The IMU's fixed reference reading d0 (3,): 0 for physical units and signed words, mid-scale for unsigned words.
-
-    Decided per axis from readings (n, 3): counts that never go below 0 and pass 32767/2 on average are unsigned 16-bit words."""
-    if unit != "counts":
-        return np.zeros(3)
-    return np.full(3, 32768.0) if np.nanmin(logged) >= 0 and np.nanmedian(logged) > 16384 else np.zeros(3)

@@ -71,12 +71,15 @@ def covariance_of(table: pl.DataFrame) -> Array:
     return np.asarray(table.sort("row", "column")["value"].to_numpy().reshape(size, size))
 
 
-def constants(calibration: pl.DataFrame, sensor: str, method: str | None = None) -> tuple[Array, Array] | None:
-    """(Λ (3, 3), b (3,)) of a sensor from `calibration` rows with status ok on every axis; None where refused."""
+def constants(
+    calibration: pl.DataFrame, sensor: str, method: str | None = None, *, refused_too: bool = False
+) -> tuple[Array, Array] | None:
+    """(Λ (3, 3), b (3,)) of a sensor from `calibration` rows; None where there are none, or (normally) one is
+    refused."""
     rows = calibration.filter(pl.col("sensor") == sensor)
     if method is not None:
         rows = rows.filter(pl.col("method") == method)
-    if rows.is_empty() or (rows["status"] != "ok").any():
+    if rows.is_empty() or (not refused_too and (rows["status"] != "ok").any()):
         return None
     value = {(p, a): v for p, a, v in rows.select("parameter", "axis", "value").iter_rows()}
     bias = np.array([value["bias", a] for a in AXES])

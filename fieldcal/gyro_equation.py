@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from fieldcal.errors import UnusableFlight
 from fieldcal.rotation import Array, body_rate, rate_matrix
-from fieldcal.statistics import huber_weights, least_squares_covariance, robust_sigma
+from fieldcal.statistics import huber_inflation, huber_weights, least_squares_covariance, robust_sigma
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ def fit_equation_error(
     q, q_dot : (n, 4) arrays
         Attitude and its local smoothed derivative, 1/s, hemisphere continuous.
     rate_logged : (n, 3) array
-        Gyroscope as logged, ω_d, body axes, smoothed with the *same* weights as the attitude: noise in this regressor pulls the scales towards
-        zero (−3.5 % raw, −0.8 % smoothed at the paper's noise).
+        Gyroscope as logged, ω_d, body axes, smoothed with the *same* weights as the attitude: noise in this regressor
+        pulls the scales towards zero (−3.5 % raw, −0.8 % smoothed at the paper's noise).
     equations : {"all", "scalar"}
         "scalar" is the paper's δ̇ alone (Eq. 12–15, with the ½ the paper's X lacks). "all" uses the four: ω̂ = 2Ξᵀq̇
         on (ω_d, 1), where the axes decouple.
@@ -66,19 +66,27 @@ def fit_equation_error(
     if not (spread > 0).all():
         raise UnusableFlight("gyro_not_excited", "A gyroscope axis reads one constant value: stuck, or never turned.")
     x = (w_d - centre) / spread
+    robust = weights is not None
+    theta: Array = np.zeros(6)
+    white: Array = np.zeros((6, 6))
+    coloured: Array = np.zeros((6, 6))
+    squares = 0.0
     if equations == "all":
-        target, sensitivity = body_rate(q, q_dot), np.zeros((n, 3, 6))
+        # ω̂ = 2Ξᵀq̇ on (ω_d, 1): one small regression an axis
+        target = body_rate(q, q_dot)
         for i in range(3):
-            sensitivity[:, i, i], sensitivity[:, i, 3 + i] = x[:, i], 1.0
+            own = np.ix_([i, 3 + i], [i, 3 + i])
+            sensitivity = np.stack([x[:, i], np.ones(n)], axis=1)
+            pair = _robust_solve(sensitivity, target[:, i], trust, robust=robust)
+            theta[[i, 3 + i]], residual, white[own], coloured[own] = pair
+            squares += float(residual @ residual)
     elif equations == "scalar":
         half = -0.5 * q[:, :3]  # the last row of ½Ξ
-        target = q_dot[:, 3:]
-        sensitivity = np.concatenate([half * x, half], axis=1)[:, None, :]
+        sensitivity = np.concatenate([half * x, half], axis=1)
+        theta, residual, white, coloured = _robust_solve(sensitivity, q_dot[:, 3], trust, robust=robust)
+        squares = float(residual @ residual)
     else:
         raise ValueError(f'equations is "all" or "scalar", not {equations!r}')
-    theta, residual, weight = _robust_solve(sensitivity, target, trust, robust=weights is not None)
-    root = np.sqrt(weight)
-    white, coloured = least_squares_covariance(sensitivity * root[:, :, None], residual * root)
     # z = λ' (ω_d − c)/s + b'  →  λ = λ'/s, b = b' − λ c
     transform = np.zeros((6, 6))
     transform[:3, :3] = np.diag(1.0 / spread)
@@ -90,23 +98,33 @@ def fit_equation_error(
         bias=constants[3:],
         covariance=transform @ coloured @ transform.T,
         covariance_white=transform @ white @ transform.T,
-        residual_rms=float(np.sqrt(np.mean(residual**2))),
+        residual_rms=float(np.sqrt(squares / n)),
         n_samples=n,
     )
 
 
-def _robust_solve(sensitivity: Array, target: Array, trust: Array, *, robust: bool) -> tuple[Array, Array, Array]:
-    """Weighted least squares (Huber-refined when `robust`): θ (p,), residual (n, c), weights (n, c)."""
-    n, channels, p = sensitivity.shape
-    flat, y = sensitivity.reshape(-1, p), target.reshape(-1)
-    weight = np.repeat(trust, channels)
+def _robust_solve(
+    sensitivity: Array, target: Array, trust: Array, *, robust: bool
+) -> tuple[Array, Array, Array, Array]:
+    """Weighted least squares (Huber-refined when `robust`): θ (p,), residual (n,), its two covariances (p, p)."""
+    weight = trust
+    inflation = 1.0
     for _ in range(6 if robust else 1):
-        weighted = flat * weight[:, None]
-        theta = np.linalg.solve(weighted.T @ flat, weighted.T @ y)
-        residual = y - flat @ theta
+        weighted = sensitivity * weight[:, None]
+        theta = np.linalg.solve(weighted.T @ sensitivity, weighted.T @ target)
+        residual = target - sensitivity @ theta
         if robust:
-            weight = np.repeat(trust, channels) * huber_weights(residual, robust_sigma(residual))
-    return theta, residual.reshape(n, channels), weight.reshape(n, channels)
+            huber = huber_weights(residual, robust_sigma(residual))
+            weight = trust * huber
+            inflation = huber_inflation(huber)
+    white, coloured = _covariances(sensitivity, residual, weight)
+    return theta, residual, white, coloured * inflation
+
+
+def _covariances(sensitivity: Array, residual: Array, weight: Array) -> tuple[Array, Array]:
+    """Cramér–Rao and coloured covariance (p, p) of one weighted regression."""
+    root = np.sqrt(weight)
+    return least_squares_covariance((sensitivity * root[:, None])[:, None, :], (residual * root)[:, None])
 
 
 def predicted_quaternion_rate(q: ArrayLike, rate: ArrayLike) -> Array:

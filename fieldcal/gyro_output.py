@@ -1,11 +1,13 @@
 """Gyroscope scale and bias by output error: integrate Eq. 10 with the real stamps and match the attitude.
 
-The paper integrates once from a known start. Over tens of seconds that ignores what gyroscope noise does to an integral (0.135 rad/s is
-a 3.6° random walk in 40 s), so by default the record is cut into stretches, each with an initial attitude of its own that is eliminated
-(multiple shooting).
+The paper integrates once from a known start. Over tens of seconds that ignores what gyroscope noise does to an
+integral (0.135 rad/s is a 3.6° random walk in 40 s), so by default the record is cut into stretches, each with an
+initial attitude of its own that is eliminated (multiple shooting).
 """
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,7 +25,7 @@ from fieldcal.rotation import (
     rotation_steps,
     to_rotation_vector,
 )
-from fieldcal.statistics import huber_weights, least_squares_covariance, robust_sigma
+from fieldcal.statistics import huber_inflation, huber_weights, least_squares_covariance, robust_sigma
 
 
 def shooting_segments(t: ArrayLike, segment: ArrayLike, longest_s: float) -> np.ndarray:
@@ -53,10 +55,11 @@ def propagate_stretches(t: Array, rate: Array, stretch: Array) -> Array:
 
 
 def start_stretches(relative: Array, q: Array, stretch: Array, weight: Array, *, fixed: bool) -> Array:
-    """Initial attitudes put on: the best rotation of each stretch onto the measured attitudes, or its first sample (`fixed`)."""
+    """Initial attitudes put on: the best rotation of each stretch onto the measured attitudes, or its first sample
+    (`fixed`)."""
     out = np.empty_like(relative)
     bounds = np.r_[np.flatnonzero(np.r_[True, stretch[1:] != stretch[:-1]]), len(stretch)]
-    for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+    for a, b in pairwise(bounds):
         start = q[a] if fixed else mean_quaternion(multiply(q[a:b], conjugate(relative[a:b])), weight[a:b])
         out[a:b] = multiply(start, relative[a:b])
     return out
@@ -147,14 +150,15 @@ def fit_output_error(
     x_scale = np.maximum(np.sqrt(np.mean((w_d - centre) ** 2, axis=0)), 1e-300)
     x = (w_d - centre) / x_scale  # parameters scaled to O(1): absolute tolerances on λ ≈ 2e-4 would pass at once
     theta = np.concatenate([start.scale * x_scale, start.bias + start.scale * centre])
-    weight = trust
+    weight, inflation = trust, 1.0
     first = np.r_[True, stretch[1:] != stretch[:-1]]
     dt = np.where(first[1:], 0.0, np.diff(t))
     for iteration in range(1, max_iterations + 1):
         residual, model = attitude_error(t, q, theta[:3] * x + theta[3:], stretch, weight, fixed=fixed)
         if robust:
             length = np.sqrt(np.einsum("ni,ni->n", residual, residual))
-            weight = trust * huber_weights(length, robust_sigma(length))
+            huber = huber_weights(length, robust_sigma(length))
+            weight, inflation = trust * huber, huber_inflation(huber)
         sensitivity = attitude_sensitivity(dt, model, x, first)
         if not fixed:
             sensitivity = without_stretch_means(sensitivity, first, weight)
@@ -169,7 +173,8 @@ def fit_output_error(
         theta = theta + step
         if not np.isfinite(theta).all():
             break
-        # Settled: every step is a small part of the smallest standard deviation one could claim, or of the value itself.
+        # Settled: every step is a small part of the smallest standard deviation one could claim, or of the value
+        # itself.
         claimed = np.sqrt(np.diagonal(np.linalg.pinv(normal, hermitian=True)) * float(y @ y) / (3 * n))
         if (np.abs(step) < np.maximum(0.02 * claimed, 1e-8 * float(np.max(np.abs(theta))))).all():
             white, coloured = least_squares_covariance(sensitivity * root[:, None, None], centred * root[:, None])
@@ -181,7 +186,7 @@ def fit_output_error(
             return GyroFit(
                 scale=constants[:3],
                 bias=constants[3:],
-                covariance=transform @ coloured @ transform.T,
+                covariance=inflation * transform @ coloured @ transform.T,
                 covariance_white=transform @ white @ transform.T,
                 residual_rms=float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
                 n_samples=n,

@@ -24,7 +24,8 @@ class Segment:
 
 @dataclass(frozen=True)
 class Selection:
-    """Segments in order, and the numbers that decided: excited time, s; sustained level, threshold and noise of the windowed rate."""
+    """Segments in order, and the numbers that decided: excited time, s; sustained level, threshold and noise of the
+    windowed rate."""
 
     segments: list[Segment]
     excited_s: float
@@ -78,10 +79,10 @@ def select(
 ) -> Selection:
     """Split a log of any length into used and unused stretches.
 
-    A sample is excited when the rotation in the window around it exceeds `excited_ratio` of the level that the log sustains
-    for `min_s`, and four times what the sensor's noise alone would show. Excited samples are padded by `pad_s` on either side, and by up
-    to `rest_s` of rest: there the attitude is best known, which anchors the integrated gyroscope. Segments are cut where samples
-    pause for more than `max_gap_s`.
+    A sample is excited when the rotation in the window around it exceeds `excited_ratio` of the level that the log
+    sustains for `min_s`, and four times what the sensor's noise alone would show. Excited samples are padded by
+    `pad_s` on either side, and by up to `rest_s` of rest: there the attitude is best known, which anchors the
+    integrated gyroscope. Segments are cut where samples pause for more than `max_gap_s`.
 
     Parameters
     ----------

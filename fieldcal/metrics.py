@@ -12,7 +12,8 @@ from fieldcal.rotation import angle_between
 
 @dataclass(frozen=True)
 class Fit:
-    """TIC in [0, 1], its bias, variance and covariance shares (sum 1; NaN for a perfect fit), rms error and sample count."""
+    """TIC in [0, 1], its bias, variance and covariance shares (sum 1; NaN for a perfect fit), rms error and sample
+    count."""
 
     tic: float
     bias: float

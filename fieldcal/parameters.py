@@ -63,7 +63,7 @@ PARAMETERS: dict[str, Parameter] = {
     "initial_attitude": Parameter("estimated", "output error: initial attitudes", choices=("estimated", "fixed")),
     "shooting_s": Parameter(
         0.0,
-        "output error: longest stretch integrated from one initial attitude; 0 weighs gyroscope noise against attitude error",
+        "output error: longest stretch integrated from one initial attitude; 0 lets the noise decide",
         "s",
         bounds=(0.0, 1e5),
     ),

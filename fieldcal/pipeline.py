@@ -1,7 +1,7 @@
 """The whole data path, as one tuple: who reads what, who writes what, and which settings matter.
 
-Tables are named `stage.table`; the log's own are `ingest.imu`, `ingest.magnetometer`, … . `run_flight` walks it in memory; the
-night walks the same tuple through its cache.
+Tables are named `stage.table`; the log's own are `ingest.imu`, `ingest.magnetometer`, … . `run_flight` walks it in
+memory; the night walks the same tuple through its cache.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 
 import polars as pl
 
-from fieldcal import stages, validation
 from fieldcal.results import StageResult
+from fieldcal.stages import attitude, comparison, gyroscope, preparation, vector_triads, vps
 
 Run = Callable[[Mapping[str, pl.DataFrame], Mapping[str, Any]], StageResult]
 
@@ -50,7 +50,7 @@ MAGNETOMETER = {"magnetometer": "magnetometer.calibration", "magnetometer_covari
 PIPELINE: tuple[Stage, ...] = (
     Stage(
         "manoeuvre",
-        stages.find_manoeuvre,
+        preparation.find_manoeuvre,
         {"imu": "ingest.imu"},
         ("imu",),
         ("segments",),
@@ -65,7 +65,7 @@ PIPELINE: tuple[Stage, ...] = (
     ),
     Stage(
         "smoothing",
-        stages.smooth,
+        preparation.smooth,
         {"imu": "ingest.imu", "magnetometer": "ingest.magnetometer", "segments": "manoeuvre.segments"},
         ("imu", "segments"),
         ("samples",),
@@ -73,7 +73,7 @@ PIPELINE: tuple[Stage, ...] = (
     ),
     Stage(
         "magnetometer",
-        stages.calibrate_magnetometer,
+        vector_triads.calibrate_magnetometer,
         {**SAMPLES, "magnetometer": "ingest.magnetometer", "segments": "manoeuvre.segments"},
         ("samples", "segments"),
         ("calibration", "covariance"),
@@ -81,7 +81,7 @@ PIPELINE: tuple[Stage, ...] = (
     ),
     Stage(
         "accelerometer",
-        stages.calibrate_accelerometer,
+        vector_triads.calibrate_accelerometer,
         SAMPLES,
         ("samples",),
         ("calibration", "covariance"),
@@ -89,7 +89,7 @@ PIPELINE: tuple[Stage, ...] = (
     ),
     Stage(
         "attitude",
-        stages.estimate_attitude,
+        attitude.estimate_attitude,
         {**SAMPLES, **MAGNETOMETER, "accelerometer": "accelerometer.calibration"},
         ("samples",),
         ("attitude",),
@@ -97,7 +97,7 @@ PIPELINE: tuple[Stage, ...] = (
     ),
     Stage(
         "gyro_equation",
-        stages.calibrate_gyro_equation,
+        gyroscope.calibrate_gyro_equation,
         {**SAMPLES, "attitude": "attitude.attitude"},
         ("samples", "attitude"),
         ("calibration", "covariance"),
@@ -106,7 +106,7 @@ PIPELINE: tuple[Stage, ...] = (
     # Second pass, now with rates: lever arm (Eq. 3) and sample gate.
     Stage(
         "accelerometer_pass2",
-        stages.calibrate_accelerometer_gated,
+        vector_triads.calibrate_accelerometer_gated,
         {
             **SAMPLES,
             "accelerometer": "accelerometer.calibration",
@@ -128,7 +128,7 @@ PIPELINE: tuple[Stage, ...] = (
     ),
     Stage(
         "attitude_pass2",
-        stages.estimate_attitude,
+        attitude.estimate_attitude,
         {**SAMPLES, **MAGNETOMETER, "accelerometer": "accelerometer_pass2.calibration"},
         ("samples",),
         ("attitude",),
@@ -136,7 +136,7 @@ PIPELINE: tuple[Stage, ...] = (
     ),
     Stage(
         "gyro_equation_pass2",
-        stages.calibrate_gyro_equation,
+        gyroscope.calibrate_gyro_equation,
         {**SAMPLES, "attitude": "attitude_pass2.attitude"},
         ("samples", "attitude"),
         ("calibration", "covariance"),
@@ -144,7 +144,7 @@ PIPELINE: tuple[Stage, ...] = (
     ),
     Stage(
         "gyro_output",
-        stages.calibrate_gyro_output,
+        gyroscope.calibrate_gyro_output,
         {
             **SAMPLES,
             **MAGNETOMETER,
@@ -159,13 +159,12 @@ PIPELINE: tuple[Stage, ...] = (
     ),
     Stage(
         "vps_sync",
-        validation.synchronise_vps,
+        vps.synchronise_vps,
         {
             "imu": "ingest.imu",
             "vps": "ingest.vps",
             "attitude": "attitude_pass2.attitude",
-            "gyro_equation": "gyro_equation_pass2.calibration",
-            "gyro_output": "gyro_output.calibration",
+            "gyroscope": "gyro_output.calibration",
         },
         ("imu",),
         ("sync", "vps_aligned"),
@@ -173,14 +172,13 @@ PIPELINE: tuple[Stage, ...] = (
     ),
     Stage(
         "verify",
-        validation.verify_fit,
+        comparison.verify_fit,
         {
             **SAMPLES,
             "magnetometer": "magnetometer.calibration",
             "accelerometer": "accelerometer_pass2.calibration",
             "attitude": "attitude_pass2.attitude",
-            "gyro_equation": "gyro_equation_pass2.calibration",
-            "gyro_output": "gyro_output.calibration",
+            "gyroscope": "gyro_output.calibration",
             "vps_aligned": "vps_sync.vps_aligned",
         },
         ("samples", "attitude"),
@@ -194,8 +192,7 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
     "calibration": (
         "magnetometer.calibration",
         "accelerometer_pass2.calibration",
-        "gyro_equation_pass2.calibration",
-        "gyro_output.calibration",
+        "gyro_output.calibration",  # equation error's rows too
     ),
     "fit": ("verify.fit",),
     "sync": ("vps_sync.sync",),

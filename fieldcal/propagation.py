@@ -1,7 +1,8 @@
 """What the magnetometer's and accelerometer's own uncertainty does to attitude and on to the gyroscope (first order).
 
-The method is serial: an error of the first triads turns the attitudes that the gyroscope is fitted to, and moves with the motion, so the
-gyroscope's residuals cannot show it. Here their covariance is carried through Wahba's problem and the output-error normal equations.
+The method is serial: an error of the first triads turns the attitudes that the gyroscope is fitted to, and moves
+with the motion, so the gyroscope's residuals cannot show it. Here their covariance is carried through Wahba's
+problem and the output-error normal equations.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ def constants_to_gyro(
 ) -> Array:
     """Covariance (6, 6) that uncertain vector triads add to the gyroscope's (λ, b).
 
-    `pairs` holds, for each independent triad, ∂φ/∂(its constants) (n, 3, 6) in the gyroscope's axes and their covariance
-    (6, 6). δθ = M⁻¹ Σ Sᵀ w R_ns φ with output error's own S, w and M.
+    `pairs` holds, for each independent triad, ∂φ/∂(its constants) (n, 3, 6) in the gyroscope's axes and their
+    covariance (6, 6). δθ = M⁻¹ Σ Sᵀ w R_ns φ with output error's own S, w and M.
     """
     if not pairs:
         return np.zeros((6, 6))

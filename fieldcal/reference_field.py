@@ -44,7 +44,8 @@ def world_magnetic_model(latitude_deg: float, longitude_deg: float, altitude_m: 
     except ValueError as error:
         raise ConfigurationError(
             "field_outside_model",
-            f"The World Magnetic Model does not cover {when.date()}: configure field.north_east_down instead ({error}).",
+            f"The World Magnetic Model does not cover {when.date()}: configure"
+            f" field.north_east_down instead ({error}).",
         ) from error
     return np.array([result.x, result.y, result.z]) * 1e-9
 

@@ -17,8 +17,8 @@ from fieldcal.rotation import Array
 class StageResult:
     """Tables that a stage made, how it ended and the numbers that decided it.
 
-    `status`: "ok"; "refused": the recording does not determine it (tables may still carry refused values); "absent": there is
-    nothing to do (no VPS in the log); "failed": an error of ours, told in `reason`.
+    `status`: "ok"; "refused": the recording does not determine it (tables may still carry refused values); "absent":
+    there is nothing to do (no VPS in the log); "failed": an error of ours, told in `reason`.
     """
 
     tables: dict[str, pl.DataFrame] = field(default_factory=dict)

@@ -98,7 +98,7 @@ def from_matrix(a: ArrayLike) -> Array:
         q[j] = a[i, j] + a[j, i]
         q[m] = a[i, m] + a[m, i]
         q[3] = a[j, m] - a[m, j]
-    q = normalise(q)
+    q /= np.linalg.norm(q)
     return q if q[3] >= 0 else -q
 
 

@@ -50,3 +50,14 @@ def to_centre_of_mass(
     scale = np.asarray(scale, dtype=float)
     inverse = np.diag(1.0 / scale) if scale.ndim == 1 else np.linalg.inv(scale)
     return np.asarray(logged, dtype=float) - sensed @ inverse.T
+
+
+def default_reference_reading(logged: ArrayLike, unit: str) -> Array:
+    """The IMU's fixed reference reading d0 (3,): 0 for physical units and signed words, mid-scale for unsigned words.
+
+    Decided per axis from readings (n, 3): counts that never go below 0 and pass 32767/2 on average are unsigned
+    16-bit words."""
+    logged = np.asarray(logged, dtype=float)
+    if unit != "counts":
+        return np.zeros(3)
+    return np.full(3, 32768.0) if np.nanmin(logged) >= 0 and np.nanmedian(logged) > 16384 else np.zeros(3)

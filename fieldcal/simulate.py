@@ -1,7 +1,7 @@
 """The paper's experiment with known truth, and what may go wrong in it: arrays in, arrays out (files: `simulate_logs`).
 
-Three sets of one doublet per axis, MEMS triads behind a two-pole 50 Hz band limit and 16-bit converters at 185 Hz (Table 1),
-Tables 2–4's constants with their signs put right, a VPS at 350 Hz on a clock of its own.
+Three sets of one doublet per axis, MEMS triads behind a two-pole 50 Hz band limit and 16-bit converters at 185 Hz
+(Table 1), Tables 2–4's constants with their signs put right, a VPS at 350 Hz on a clock of its own.
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ class Recording:
 
     Logged: `t` (n,) IMU stamps, s; `counts` sensor → (n, 3); `temperature` (n,) °C; `vps_t` (m,) s on the VPS clock;
     `vps_q` (m, 4) body to NED world; `vps_position` (m, 3) m.
-    Truth: `q` (n, 4) and `rate` (n, 3) at t as the sensors saw them, i.e. delayed by the sensor filter; `lag_s` (VPS clock + lag
-    = IMU clock at the first IMU sample) including that delay; `delay_s`; the two constant VPS rotations.
+    Truth: `q` (n, 4) and `rate` (n, 3) at t as the sensors saw them, i.e. delayed by the sensor filter; `lag_s` (VPS
+    clock + lag = IMU clock at the first IMU sample) including that delay; `delay_s`; the two constant VPS rotations.
     """
 
     experiment: Experiment

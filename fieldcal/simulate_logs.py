@@ -1,4 +1,5 @@
-"""Simulated flights as an archive of logs: `<vehicle>/<session>/<flight>` with a fieldcal.toml, and the truth beside each log."""
+"""Simulated flights as an archive of logs: `<vehicle>/<session>/<flight>` with a fieldcal.toml, and the truth beside
+each log."""
 
 from __future__ import annotations
 
@@ -11,7 +12,9 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal.frames import AXES, QUATERNION, columns_of
+from fieldcal.configuration import parse
+from fieldcal.flight import flight_settings
+from fieldcal.frames import AXES, QUATERNION, columns_of, triad
 from fieldcal.logs.write_mcap import pose_channel, raw_imu_channel, write_mcap
 from fieldcal.simulate import SENSORS, Experiment, Recording, constants_at, simulate
 
@@ -30,9 +33,10 @@ def write_flights(
 ) -> list[Path]:
     """Write an archive of simulated flights and return the logs, sorted.
 
-    Vehicle 1 carries Tables 2–4's constants, the others are varied by a few per cent and a few hundred counts. Every flight
-    has its own seed (from `experiment.seed`), sessions are a week apart. Beside each log stand `<flight>.truth.json` (constants at the
-    flight's mean temperature, lag, rotations) and `<flight>.truth.parquet` (attitude and rates as the sensors saw them).
+    Vehicle 1 carries Tables 2–4's constants, the others are varied by a few per cent and a few hundred counts. Every
+    flight has its own seed (from `experiment.seed`), sessions are a week apart. Beside each log stand
+    `<flight>.truth.json` (constants at the flight's mean temperature, lag, rotations) and `<flight>.truth.parquet`
+    (attitude and rates as the sensors saw them).
 
     Parameters
     ----------
@@ -118,6 +122,28 @@ def write_flight(folder: Path, name: str, r: Recording, start: datetime, *, log_
         }
     ).write_parquet(folder / f"{name}.truth.parquet")
     return log
+
+
+def signals(r: Recording) -> dict[str, pl.DataFrame]:
+    """The recording as signal tables, as if its log had been read; stamps from 0."""
+    t_ns = np.rint(r.t * 1e9).astype(np.int64)
+    imu = np.hstack([r.counts["gyroscope"], r.counts["accelerometer"]])
+    out = {
+        "imu": pl.DataFrame({"t_ns": t_ns, **columns_of(imu, triad("gyroscope") + triad("accelerometer"))}),
+        "magnetometer": pl.DataFrame({"t_ns": t_ns, **columns_of(r.counts["magnetometer"], triad("magnetometer"))}),
+        "temperature": pl.DataFrame({"t_ns": t_ns, "temperature_degc": r.temperature}),
+    }
+    if len(r.vps_t):
+        pose = np.hstack([r.vps_q, r.vps_position])
+        vps_ns = np.rint(r.vps_t * 1e9).astype(np.int64)
+        out["vps"] = pl.DataFrame({"t_ns": vps_ns, **columns_of(pose, (*QUATERNION, "px_m", "py_m", "pz_m"))})
+    return out
+
+
+def settings(e: Experiment, vehicle_id: str = "sim-1", **changes: Any) -> dict[str, Any]:
+    """Flight settings of a simulated vehicle, as its fieldcal.toml gives them; `changes` replace parameters."""
+    vehicle = parse(_vehicle_table(vehicle_id, e), None).vehicle(vehicle_id)
+    return flight_settings(vehicle, units=dict.fromkeys(SENSORS, "counts")) | changes
 
 
 def _write_mcap(path: Path, r: Recording, t_ns: np.ndarray, vps_ns: np.ndarray, start_ns: int) -> None:

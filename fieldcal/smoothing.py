@@ -1,4 +1,5 @@
-"""Fixed-weight smoothing, local smoothed differentiation and the sample lattice they run on (reference 21 of the paper)."""
+"""Fixed-weight smoothing, local smoothed differentiation and the sample lattice they run on (reference 21 of the
+paper)."""
 
 from __future__ import annotations
 
@@ -92,7 +93,8 @@ def lattice(t: ArrayLike) -> tuple[np.ndarray, float]:
 
 
 def fill(index: np.ndarray, x: ArrayLike) -> Array:
-    """Columns x (n, m) on every lattice place 0 … index[-1]; holes filled linearly (short ones: see the caller's gap rule)."""
+    """Columns x (n, m) on every lattice place 0 … index[-1]; holes filled linearly (short ones: see the caller's gap
+    rule)."""
     x = np.asarray(x, dtype=float)
     n = int(index[-1]) + 1
     if n == len(x):
@@ -102,7 +104,8 @@ def fill(index: np.ndarray, x: ArrayLike) -> Array:
 
 
 def smooth_samples(t: ArrayLike, x: ArrayLike, cutoff_hz: float, *, side_s: float = 0.5, ends: str = "odd") -> Array:
-    """Low-pass x (n, m) at its own stamps t (n,), one contiguous stretch; lost samples are bridged for the filter only."""
+    """Low-pass x (n, m) at its own stamps t (n,), one contiguous stretch; lost samples are bridged for the filter
+    only."""
     x = np.asarray(x, dtype=float)
     if cutoff_hz <= 0 or len(x) < 3:
         return x.copy()

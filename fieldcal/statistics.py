@@ -27,11 +27,27 @@ def huber_weights(residual: ArrayLike, sigma: float) -> Array:
     return np.where(magnitude > limit, limit / np.maximum(magnitude, limit), 1.0)
 
 
+def huber_inflation(weights: ArrayLike) -> float:
+    """What Huber weights take from the information that they seem to leave: (mean w / share of weights at 1)².
+
+    A clipped residual says nothing of small parameter changes (ψ′ = 0) although its weight is not 0; the covariance
+    of an M-estimator has ψ′, not w, in its outer factors."""
+    w = np.asarray(weights, dtype=float)
+    return float(w.mean() / max(float(np.mean(w >= 1.0)), 0.1)) ** 2
+
+
+def white_noise_sigma(x: ArrayLike) -> Array:
+    """Sample-to-sample noise of each column of x (n, m), in time order, (m,): robust, from second differences, so that
+    motion slower than the sampling does not count."""
+    second = np.diff(np.asarray(x, dtype=float), n=2, axis=0)
+    return MAD_TO_SIGMA * np.median(np.abs(second), axis=0) / np.sqrt(6.0)
+
+
 def coloured_information(sensitivity: ArrayLike, residual: ArrayLike) -> Array:
     """Σ_i Σ_j S_iᵀ 𝓡(i−j) S_j, the middle of the coloured-residual covariance.
 
-    𝓡 is the biased autocorrelation of each residual channel under a triangular taper of N/10 lags: its spectrum cannot be
-    negative, unlike the unbiased one's. By FFT.
+    𝓡 is the biased autocorrelation of each residual channel under a triangular taper of N/10 lags: its spectrum
+    cannot be negative, unlike the unbiased one's. By FFT.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Synchronise the VPS with the IMU: clock offset, clock drift and the two constant rotations between their frames.
 
 Coarse: masked, normalised cross-correlation of rotation-rate norms (no frame alignment needed), parabolic peak.
-Fine: Gauss–Newton on the vector rates, ω_imu(t) ≈ M ω_vps(t) + c with the VPS stamps stretched and moved; the free 3×3 M takes up
-any constant rotation and any calibration the gyroscope still lacks, so neither can move the lag.
+Fine: Gauss–Newton on the vector rates, ω_imu(t) ≈ M ω_vps(t) + c with the VPS stamps stretched and moved; the free
+3×3 M takes up any constant rotation and any calibration the gyroscope still lacks, so neither can move the lag.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ FINE_CUTOFF_HZ = 8.0
 
 @dataclass(frozen=True)
 class UniformRates:
-    """Rates on a uniform grid starting at `start_s` with `interval_s`: `rate` (n, 3), rad/s or logged units; `valid` (n,)."""
+    """Rates on a uniform grid starting at `start_s` with `interval_s`: `rate` (n, 3), rad/s or logged units; `valid`
+    (n,)."""
 
     start_s: float
     interval_s: float
@@ -48,10 +49,11 @@ class UniformRates:
 
 @dataclass(frozen=True)
 class SyncFit:
-    """VPS clock + lag = IMU clock. `lag_s` at the first IMU sample, `lag_mid_s` at mid-record, `skew_ppm` > 0: VPS clock fast.
+    """VPS clock + lag = IMU clock. `lag_s` at the first IMU sample, `lag_mid_s` at mid-record, `skew_ppm` > 0: VPS
+    clock fast.
 
-    `peak` and `runner_up` are correlations (the second: best one outside the peak); `matrix` (3, 3) maps VPS body rates to
-    logged rates."""
+    `peak` and `runner_up` are correlations (the second: best one outside the peak); `matrix` (3, 3) maps VPS body
+    rates to logged rates."""
 
     lag_s: float
     lag_mid_s: float
@@ -251,7 +253,7 @@ def _refine(
         inside[inside] = vps.valid[nearest[inside].astype(int)]
         w, w_dot = spline(at[inside]), slope(at[inside])
         x = np.column_stack([w, np.ones(len(w))])
-        weight = np.ones(len(w))
+        weight: Array = np.ones(len(w))
         for _ in range(3):
             xw = x * weight[:, None]
             solution = np.linalg.lstsq(xw.T @ x, xw.T @ imu.rate[inside], rcond=None)[0]
@@ -301,7 +303,7 @@ def align_frames(q_imu: ArrayLike, q_vps: ArrayLike, *, iterations: int = 10) ->
     leaves a part of one unobserved, it stays at the identity's side."""
     q_imu, q_vps = np.asarray(q_imu, dtype=float), np.asarray(q_vps, dtype=float)
     body = np.array([0.0, 0.0, 0.0, 1.0])
-    weight = np.ones(len(q_imu))
+    weight: Array = np.ones(len(q_imu))
     for _ in range(iterations):
         world = mean_quaternion(multiply(q_imu, conjugate(multiply(q_vps, body))), weight)
         body = mean_quaternion(multiply(conjugate(multiply(world, q_vps)), q_imu), weight)

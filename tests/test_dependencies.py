@@ -15,13 +15,14 @@ NUMERICS = {"fieldcal", "numpy", "scipy", "pygeomag"}
 TABLES = NUMERICS | {"schemas", "polars", "pyarrow"}
 LOGS = TABLES | {"mcap", "google", "lz4", "zstandard"}
 
-TABLE_LAYER = ("frames", "results", "stages", "validation", "pipeline", "simulate_logs")
+TABLE_LAYER = ("frames", "results", "pipeline", "simulate_logs", "ingest")
 """Modules of fieldcal that turn columns into arrays and back; all others are numerics and know no table."""
 
 ALLOWED = {
     "schemas/": {"schemas", "pyarrow"},
     "fieldcal/": NUMERICS,
     **{f"fieldcal/{name}.py": TABLES for name in TABLE_LAYER},
+    "fieldcal/stages/": TABLES,
     "fieldcal/logs/": LOGS,
     "warehouse/": {"warehouse", "schemas", "fieldcal", "numpy", "polars", "pyarrow", "duckdb"},
 }

@@ -1,0 +1,143 @@
+"""Attitude from the two vector triads, and what else is made of their calibrated vectors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import polars as pl
+
+from fieldcal import attitude as wahba
+from fieldcal import sensor
+from fieldcal.frames import QUATERNION, columns_of, constants, matrix, triad
+from fieldcal.results import StageResult
+from fieldcal.rotation import Array, from_matrix, multiply
+from fieldcal.stages.inputs import Settings, Tables, spread_of
+
+VECTOR_SENSORS = ("magnetometer", "accelerometer")
+
+
+# Trust in an attitude halves where the sensed length is off by this share of the field.
+TRUST_ACCELERATION, TRUST_FIELD = 0.01, 0.01
+
+
+# The angle between field and gravity is one number: a median scatter above this says an axis or sign is wrong.
+# Judged on the samples that motion and magnets disturb least.
+MAX_DIP_SCATTER_DEG = 10.0
+
+
+TRUSTED_SHARE = 0.2
+
+
+def logged_constants(s: Settings, name: str) -> tuple[Array, Array] | None:
+    """Scale from the logged unit alone, bias 0: what an SI log says of itself. None for counts."""
+    nominal = s["nominal_scale"][name]
+    if nominal is None:
+        return None
+    return np.diag(np.asarray(nominal) * np.asarray(s["polarity"][name], dtype=float)), np.zeros(3)
+
+
+def vector_constants(tables: Tables, s: Settings, name: str) -> tuple[tuple[Array, Array] | None, bool]:
+    """Constants to make a vector of a triad's readings, and whether they are its own fit's.
+
+    Else what the logged unit says; a magnetometer in a physical unit where the local field is only "norm" is scaled
+    to the median length, since attitude needs directions only. None: refused raw counts."""
+    own = constants(tables[name], name) if name in tables else None
+    if own is not None:
+        return own, True
+    if s["nominal_scale"][name] is None and s["units"][name] != "counts":
+        length = float(np.nanmedian(np.linalg.norm(matrix(tables["samples"], triad(name, "smoothed_")), axis=1)))
+        scale = np.linalg.norm(s["field_ned"]) / length * np.asarray(s["polarity"][name], dtype=float)
+        return (np.diag(scale), np.zeros(3)), False
+    return logged_constants(s, name), False
+
+
+def known_vectors(tables: Tables, s: Settings) -> dict[str, tuple[Array, Array]]:
+    """Constants of both vector triads, as the attitude stage used them; call only where it gave an attitude."""
+    found = {name: vector_constants(tables, s, name)[0] for name in VECTOR_SENSORS}
+    return {name: known for name, known in found.items() if known is not None}
+
+
+def body_vectors(samples: pl.DataFrame, used: Mapping[str, tuple[Array, Array]], s: Settings, *, prefix: str) -> Array:
+    """Calibrated magnetic field and gravity-signed acceleration in body axes, (n, 2, 3)."""
+    axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    field = sensor.calibrate(matrix(samples, triad("magnetometer", prefix)), *used["magnetometer"]) @ axes.T
+    gravity = sensor.calibrate(matrix(samples, triad("accelerometer", prefix)), *used["accelerometer"]) @ axes.T
+    return np.stack([field, sensor.GRAVITY_SIGNS[s["gravity_sign"]] * gravity], axis=1)
+
+
+def estimate_attitude(tables: Tables, s: Settings) -> StageResult:
+    """samples and both triads' constants → attitude (Eq. 9), weighted by what the sensed lengths say.
+
+    Where an SI log's ellipsoid is refused its logged values are used, flagged; raw counts stop here."""
+    used: dict[str, tuple[Array, Array]] = {}
+    fallback = []
+    for name in ("magnetometer", "accelerometer"):
+        if tables["samples"][f"{name}_x"].null_count() == len(tables["samples"]):
+            return StageResult(status="refused", reason_code=f"no_{name}", reason=f"Attitude needs a {name}.")
+        own, fitted = vector_constants(tables, s, name)
+        if not fitted:
+            fallback.append(name)
+        if own is None:
+            return StageResult(
+                status="refused",
+                reason_code=f"{name}_refused",
+                reason=f"Attitude needs a calibrated {name}; its fit was refused and raw counts are no vector.",
+            )
+        used[name] = own
+    vectors = body_vectors(tables["samples"], used, s, prefix="smoothed_")
+    strength, gravity = float(np.linalg.norm(s["field_ned"])), s["gravity_mps2"]
+    field_excess = np.linalg.norm(vectors[:, 0], axis=1) / strength - 1.0
+    acceleration_excess = np.linalg.norm(vectors[:, 1], axis=1) / gravity - 1.0
+    sigma = np.array([spread_of(field_excess), spread_of(acceleration_excess)])
+    reference = np.array([s["field_ned"], [0.0, 0.0, 1.0]])
+    declination = float(np.arctan2(s["field_ned"][1], s["field_ned"][0]))
+    fit = wahba.attitudes(vectors, reference, sigma, method=s["attitude"], declination=declination)
+    weight = 1.0 / (1.0 + (acceleration_excess / TRUST_ACCELERATION) ** 2 + (field_excess / TRUST_FIELD) ** 2)
+    dip = _dip_deg(vectors)[weight >= np.quantile(weight, 1.0 - TRUSTED_SHARE)]
+    scatter = float(1.4826 * np.median(np.abs(dip - np.median(dip))))
+    expected_dip = float(np.degrees(np.arcsin(np.clip(reference[0, 2] / strength, -1, 1))))
+    measured = {
+        "logged_values_used": fallback,
+        "direction_sd_rad": {"magnetometer": float(sigma[0]), "accelerometer": float(sigma[1])},
+        "dip_deg": float(np.median(dip)),
+        "dip_expected_deg": expected_dip,
+        "dip_scatter_deg": scatter,
+        "field": s["field_source"],
+        "taste_median": float(np.median(fit.taste)),
+    }
+    if scatter > MAX_DIP_SCATTER_DEG:
+        return StageResult(
+            status="refused",
+            reason_code="vectors_contradict",
+            reason=f"The angle between magnetic field and gravity scatters by {scatter:.1f}° where it should be one"
+            " number: a wrong polarity, swapped axes, or a magnet on board.",
+            measured=measured,
+        )
+    table = pl.DataFrame(
+        {
+            "t_ns": tables["samples"]["t_ns"],
+            "segment": tables["samples"]["segment"],
+            **columns_of(fit.q, QUATERNION),
+            "attitude_sd_rad": fit.sd,
+            "taste": fit.taste,
+            "acceleration_excess_mps2": acceleration_excess * gravity,
+            "field_excess": field_excess,
+            "weight": weight,
+        }
+    )
+    code = "logged_values_used" if fallback else None
+    reason = f"Logged values stand in for the refused {' and '.join(fallback)}." if fallback else None
+    return StageResult({"attitude": table}, "ok", code, reason, measured)
+
+
+def _dip_deg(vectors: Array) -> Array:
+    """Angle of the sensed field below the sensed horizontal, degrees, (n,)."""
+    unit = vectors / np.linalg.norm(vectors, axis=2, keepdims=True)
+    return np.asarray(np.degrees(np.arcsin(np.clip(np.einsum("ni,ni->n", unit[:, 0], unit[:, 1]), -1.0, 1.0))))
+
+
+def sensor_attitude(q: Array, s: Settings) -> Array:
+    """Attitude of the sensor's own axes (n, 4) from that of the body: gyroscope constants live in sensor axes."""
+    axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    return multiply(q, from_matrix(axes.T))

@@ -1,0 +1,153 @@
+"""Everything estimated against everything the paper compares it with: TICs and physical units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal import attitude as wahba
+from fieldcal import sensor, smoothing
+from fieldcal.frames import QUATERNION, constants, matrix, seconds, triad
+from fieldcal.gyro_equation import predicted_quaternion_rate
+from fieldcal.gyro_output import propagate_stretches, start_stretches
+from fieldcal.manoeuvre import contiguous
+from fieldcal.metrics import Fit, theil, theil_attitude
+from fieldcal.results import StageResult
+from fieldcal.rotation import Array, continuous, slerp
+from fieldcal.stages.attitude import body_vectors, known_vectors, sensor_attitude
+from fieldcal.stages.inputs import Settings, Tables, differentiate_by_segment, spread_of
+from fieldcal.stages.vps import BRIDGE_S, RATE_COLUMNS, bridged, interpolate_attitude
+
+FIT_SCHEMA = {
+    "quantity": pl.String,
+    "method": pl.String,
+    "reference": pl.String,
+    "signal": pl.String,
+    "sample": pl.String,
+    "tic": pl.Float64,
+    "tic_bias": pl.Float64,
+    "tic_variance": pl.Float64,
+    "tic_covariance": pl.Float64,
+    "rms": pl.Float64,
+    "rms_unit": pl.String,
+    "n_samples": pl.Int64,
+}
+
+
+def verify_fit(tables: Tables, s: Settings) -> StageResult:
+    """Everything estimated → fit: the paper's five TICs and one more, raw and smoothed, with physical units."""
+    samples, attitude = tables["samples"], tables["attitude"]
+    t = seconds(samples["t_ns"], int(samples["t_ns"][0]))
+    segment = samples["segment"].to_numpy()
+    smoothed_q = matrix(attitude, QUATERNION)
+    sides = {"raw": _raw_attitude(tables, s), "smoothed": smoothed_q}
+    gyros = {
+        method: constants(tables["gyroscope"], "gyroscope", method, refused_too=True)
+        for method in ("equation_error", "output_error")
+        if "gyroscope" in tables
+    }
+    vps = tables.get("vps_aligned")
+    vps_t = None if vps is None else seconds(vps["t_ns"], int(samples["t_ns"][0]))
+    axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    rows: list[dict[str, Any]] = []
+
+    def add(quantity: str, method: str, reference: str, signal: str, fit: Fit, unit: str) -> None:
+        rows.append(_fit_row(quantity, method, reference, signal, fit, unit))
+
+    name = s["attitude"]
+    for signal, q in sides.items():
+        q = continuous(q)
+        rate_logged = matrix(samples, triad("gyroscope", "" if signal == "raw" else "smoothed_"))
+        if vps is not None and vps_t is not None:
+            own, near = interpolate_attitude(t, q, vps_t)
+            if near.any():
+                vps_q = matrix(vps, QUATERNION)
+                add("attitude", name, "vps", signal, theil_attitude(vps_q[near], own[near]), "deg")
+        q_sensor = continuous(sensor_attitude(q, s))
+        for method, own_constants in gyros.items():
+            if own_constants is None:
+                continue
+            rate = sensor.calibrate(rate_logged, *own_constants)
+            if method == "equation_error":
+                q_dot = differentiate_by_segment(samples, q_sensor, s["differentiation_window_s"])
+                add(
+                    "quaternion_rate",
+                    method,
+                    name,
+                    signal,
+                    theil(q_dot, predicted_quaternion_rate(q_sensor, rate)),
+                    "1/s",
+                )
+            else:
+                relative = propagate_stretches(t, rate, segment)
+                weight = attitude["weight"].to_numpy()
+                model = start_stretches(relative, q_sensor, segment, weight, fixed=s["initial_attitude"] == "fixed")
+                add("attitude_propagated", method, name, signal, theil_attitude(q_sensor, model), "deg")
+                if vps is not None and vps_t is not None:
+                    _propagated_against_vps(add, signal, t, relative, segment, vps, vps_t, s)
+            if vps is not None and vps_t is not None:
+                near = bridged(t, vps_t)
+                if near.any():
+                    body = np.column_stack([np.interp(vps_t, t, c) for c in (rate @ axes.T).T])
+                    vps_rate = matrix(vps, RATE_COLUMNS)
+                    if signal == "smoothed":
+                        vps_rate = _smoothed_blocks(vps_t, vps_rate, s)
+                    add("body_rate", method, "vps", signal, theil(vps_rate[near], body[near]), "rad/s")
+    if not rows:
+        return StageResult(status="absent", reason_code="nothing_to_compare", reason="No reference to compare with.")
+    return StageResult({"fit": pl.DataFrame(rows, schema=FIT_SCHEMA)}, measured={"comparisons": len(rows)})
+
+
+def _fit_row(quantity: str, method: str, reference: str, signal: str, fit: Fit, unit: str) -> dict[str, Any]:
+    parts = [v if np.isfinite(v) else None for v in (fit.bias, fit.variance, fit.covariance)]
+    return dict(
+        zip(
+            FIT_SCHEMA,
+            (quantity, method, reference, signal, "all", float(fit.tic), *parts, fit.rms, unit, fit.n_samples),
+            strict=True,
+        )
+    )
+
+
+def _raw_attitude(tables: Tables, s: Settings) -> Array:
+    """Attitude from unsmoothed readings with the same constants and weights as the attitude stage."""
+    vectors = body_vectors(tables["samples"], known_vectors(tables, s), s, prefix="")
+    lengths = np.linalg.norm(vectors, axis=2) / np.array([np.linalg.norm(s["field_ned"]), s["gravity_mps2"]])
+    sigma = np.array([spread_of(lengths[:, 0]), spread_of(lengths[:, 1])])
+    reference = np.array([s["field_ned"], [0.0, 0.0, 1.0]])
+    declination = float(np.arctan2(s["field_ned"][1], s["field_ned"][0]))
+    return wahba.attitudes(vectors, reference, sigma, method=s["attitude"], declination=declination).q
+
+
+def _propagated_against_vps(
+    add: Callable[..., None],
+    signal: str,
+    t: Array,
+    relative: Array,
+    segment: np.ndarray,
+    vps: pl.DataFrame,
+    vps_t: Array,
+    s: Settings,
+) -> None:
+    """Open-loop drift: the gyroscope integrated over each segment from its best start, against the VPS."""
+    to_sensor = sensor_attitude(matrix(vps, QUATERNION), s)
+    near = bridged(t, vps_t)
+    index = np.clip(np.searchsorted(t, vps_t), 0, len(t) - 1)
+    own, reference, part = slerp(t, relative, vps_t)[near], to_sensor[near], segment[index][near]
+    if len(own) < 10:
+        return
+    model = start_stretches(own, reference, part, np.ones(len(own)), fixed=False)
+    add("attitude_propagated", "output_error", "vps", signal, theil_attitude(continuous(reference), model), "deg")
+
+
+def _smoothed_blocks(t: Array, x: Array, s: Settings) -> Array:
+    """Low-pass by contiguous block of the VPS's own grid."""
+    out = np.empty_like(x)
+    for a, b in contiguous(t, BRIDGE_S):
+        out[a:b] = smoothing.smooth_samples(
+            t[a:b], x[a:b], s["smoothing_cutoff_hz"], side_s=s["smoothing_side_s"], ends=s["smoothing_ends"]
+        )
+    return out

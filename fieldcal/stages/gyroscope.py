@@ -1,0 +1,248 @@
+"""Gyroscope: equation error, then output error with the vector triads' uncertainty propagated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal import gyro_equation, gyro_output, sensor
+from fieldcal.errors import EstimationError, UnusableFlight
+from fieldcal.frames import (
+    AXES,
+    QUATERNION,
+    calibration_rows,
+    constants,
+    covariance_of,
+    covariance_table,
+    matrix,
+    seconds,
+    triad,
+)
+from fieldcal.gyro_equation import GyroFit
+from fieldcal.propagation import attitude_jacobian, constants_to_gyro
+from fieldcal.results import StageResult, triad_rows
+from fieldcal.rotation import Array
+from fieldcal.stages.attitude import VECTOR_SENSORS, body_vectors, known_vectors, logged_constants, sensor_attitude
+from fieldcal.stages.inputs import (
+    Settings,
+    Tables,
+    differentiate_by_segment,
+    mean_temperature,
+    reference_reading,
+    refusal,
+    spread_of,
+)
+from fieldcal.statistics import white_noise_sigma
+
+MAX_MEDIAN_ATTITUDE_ERROR_RAD = 0.35
+
+
+RUN_IN_STRETCH_S = 15.0
+
+
+GYRO_REASONS = "Gyroscope axes refused ({axes}): too little rotation about them, or polarity and units that contradict."
+
+
+def calibrate_gyro_equation(tables: Tables, s: Settings) -> StageResult:
+    """samples, attitude → calibration of the gyroscope by equation error (Eq. 10–15)."""
+    samples, attitude = tables["samples"], tables["attitude"]
+    logged = matrix(samples, triad("gyroscope", "smoothed_"))
+    if np.isnan(logged).any():
+        return StageResult(status="refused", reason_code="no_gyroscope", reason="The log has no gyroscope readings.")
+    q = sensor_attitude(matrix(attitude, QUATERNION), s)
+    try:
+        fit = gyro_equation.fit_equation_error(
+            q,
+            differentiate_by_segment(samples, q, s["differentiation_window_s"]),
+            logged,
+            equations=s["equations"],
+            weights=attitude["weight"].to_numpy(),
+        )
+    except UnusableFlight as error:
+        return refusal(error, "gyroscope")
+    return _gyro_result("equation_error", fit, fit.covariance, tables, s, {"residual_rms": fit.residual_rms})
+
+
+def _gyro_result(
+    method: str, fit: GyroFit, covariance: Array, tables: Tables, s: Settings, measured: dict[str, Any]
+) -> StageResult:
+    """Gyroscope rows with a status by axis: sign against polarity, size against nominal, claimed sd."""
+    relative = np.sqrt(np.diagonal(covariance)[:3]) / np.abs(fit.scale)
+    sign_wrong = np.sign(fit.scale) != np.sign(np.asarray(s["polarity"]["gyroscope"], dtype=float))
+    codes: list[str | None] = [None] * 3
+    nominal = s["nominal_scale"]["gyroscope"]
+    for i in range(3):
+        ratio = 1.0 if nominal is None else abs(fit.scale[i]) / abs(nominal[i])
+        if not relative[i] <= s["gyro_max_scale_sd"]:
+            codes[i] = "scale_uncertain"
+        elif sign_wrong[i]:
+            codes[i] = "polarity_contradiction"
+        elif not 0.5 <= ratio <= 2.0:
+            codes[i] = "scale_not_nominal"
+    measured = {
+        **measured,
+        "n_samples": fit.n_samples,
+        "iterations": fit.iterations,
+        "scale_relative_sd": [float(v) for v in relative],
+        "scale_relative_sd_cramer_rao": [
+            float(v) for v in np.sqrt(np.diagonal(fit.covariance_white)[:3]) / np.abs(fit.scale)
+        ],
+    }
+    rows = triad_rows(
+        "gyroscope",
+        method,
+        np.diag(fit.scale),
+        fit.bias,
+        covariance,
+        unit="rad/s",
+        logged_unit=s["units"]["gyroscope"],
+        reference_reading=reference_reading(s, "gyroscope", matrix(tables["samples"], triad("gyroscope"))),
+        temperature_degc=mean_temperature(tables),
+        status=tuple("ok" if c is None else "refused" for c in codes),  # type: ignore[arg-type]
+        reason_code=tuple(codes),  # type: ignore[arg-type]
+    )
+    bad = [f"{axis}: {code}" for axis, code in zip(AXES, codes, strict=True) if code]
+    status = "refused" if len(bad) == 3 else "ok"
+    reason = GYRO_REASONS.format(axes=", ".join(bad)) if bad else None
+    first = next((c for c in codes if c), None)
+    result = {"calibration": calibration_rows(rows), "covariance": covariance_table(covariance)}
+    return StageResult(result, status, first, reason, measured)
+
+
+def calibrate_gyro_output(tables: Tables, s: Settings) -> StageResult:
+    """samples, attitude, equation-error start → calibration by output error, with the triads' own uncertainty
+    propagated.
+
+    It also has the last word on equation error's rows, which it hands on: one that it contradicts is refused."""
+    equation = tables["gyroscope"]
+    result = _output_error(tables, s)
+    if "calibration" not in result.tables:
+        return replace(result, tables={"calibration": equation})
+    output = result.tables["calibration"]
+    wrong = _contradicted(equation, output)
+    judged = equation.with_columns(
+        status=pl.when(pl.col("axis").is_in(wrong)).then(pl.lit("refused")).otherwise("status"),
+        reason_code=pl.when(pl.col("axis").is_in(wrong))
+        .then(pl.lit("contradicted_by_output_error"))
+        .otherwise("reason_code"),
+    )
+    measured = {**result.measured, "equation_error_contradicted": wrong}
+    return replace(result, tables={**result.tables, "calibration": pl.concat([judged, output])}, measured=measured)
+
+
+def _contradicted(equation: pl.DataFrame, output: pl.DataFrame) -> list[str]:
+    """Axes whose equation-error scale differs from output error's by more than 3 sd of both and 1 %."""
+    pairs = (
+        equation.filter(parameter="scale", status="ok")
+        .join(output.filter(parameter="scale", status="ok"), on="axis", suffix="_oe")
+        .filter(
+            (pl.col("value") - pl.col("value_oe")).abs()
+            > pl.max_horizontal(
+                3.0 * (pl.col("sd") ** 2 + pl.col("sd_oe") ** 2).sqrt(), 0.01 * pl.col("value_oe").abs()
+            )
+        )
+    )
+    return pairs["axis"].to_list()
+
+
+def _output_error(tables: Tables, s: Settings) -> StageResult:
+    """Output error's own rows."""
+    if not s["gyro_output"]:
+        return StageResult(status="absent", reason_code="switched_off", reason="Output error is switched off.")
+    samples, attitude = tables["samples"], tables["attitude"]
+    logged = matrix(samples, triad("gyroscope"))
+    t = seconds(samples["t_ns"], samples["t_ns"][0])
+    segment, weight = samples["segment"].to_numpy(), attitude["weight"].to_numpy()
+    q = sensor_attitude(matrix(attitude, QUATERNION), s)
+    start = _start(tables["gyroscope"], t, q, logged, segment, weight, s)
+    stretch_s = s["shooting_s"] or _suitable_stretch(start, t, logged, tables)
+    options: dict[str, Any] = {
+        "segment": segment,
+        "weights": weight,
+        "initial_attitude": s["initial_attitude"],
+        "robust": s["initial_attitude"] == "estimated",
+    }
+    try:
+        if stretch_s > 1.5 * RUN_IN_STRETCH_S and s["initial_attitude"] == "estimated":
+            start = gyro_output.fit_output_error(t, q, logged, start, stretch_s=RUN_IN_STRETCH_S, **options)
+        fit = gyro_output.fit_output_error(t, q, logged, start, stretch_s=stretch_s, **options)
+    except EstimationError as error:
+        return refusal(error, "gyroscope")
+    median = gyro_output.attitude_error_median(t, q, fit.scale * logged + fit.bias, segment, stretch_s, weight)
+    measured = {
+        "stretch_s": stretch_s,
+        "attitude_error_rms_deg": float(np.degrees(fit.residual_rms)),
+        "attitude_error_median_deg": float(np.degrees(median)),
+    }
+    if median > MAX_MEDIAN_ATTITUDE_ERROR_RAD:
+        return StageResult(
+            status="refused",
+            reason_code="gyro_contradicts_attitude",
+            reason=f"The integrated gyroscope misses the attitude by {np.degrees(median):.0f}° (median): wrong polarity,"
+            " axes or units of a sensor, or attitudes spoiled by acceleration.",
+            measured=measured,
+        )
+    propagated = constants_to_gyro(t, q, segment, logged, weight, fit, stretch_s, _triad_uncertainty(tables, s))
+    measured["propagated_share_of_variance"] = [
+        float(v) for v in np.diagonal(propagated)[:3] / np.diagonal(fit.covariance + propagated)[:3]
+    ]
+    return _gyro_result("output_error", fit, fit.covariance + propagated, tables, s, measured)
+
+
+def _start(
+    equation: pl.DataFrame, t: Array, q: Array, logged: Array, segment: np.ndarray, weight: Array, s: Settings
+) -> GyroFit:
+    """The nearer of equation error's constants and, for SI logs, the logged values."""
+    values = {(p, a): v for p, a, v in equation.select("parameter", "axis", "value").iter_rows()}
+    start = GyroFit(
+        scale=np.array([values["scale", a] for a in AXES]),
+        bias=np.array([values["bias", a] for a in AXES]),
+        covariance=np.zeros((6, 6)),
+        covariance_white=np.zeros((6, 6)),
+        residual_rms=0.0,
+        n_samples=len(t),
+    )
+    own = logged_constants(s, "gyroscope")
+    if own is None:
+        return start
+    nominal = replace(start, scale=np.diagonal(own[0]).copy(), bias=own[1])
+    error = [
+        gyro_output.attitude_error_median(t, q, c.scale * logged + c.bias, segment, RUN_IN_STRETCH_S, weight)
+        for c in (start, nominal)
+    ]
+    return start if error[0] <= error[1] else nominal
+
+
+def _suitable_stretch(start: GyroFit, t: Array, logged: Array, tables: Tables) -> float:
+    """Stretch length from the gyroscope's sample-to-sample noise and the attitude's own error."""
+    noise = white_noise_sigma(logged)
+    excess = tables["attitude"]["acceleration_excess_mps2"].to_numpy(), tables["attitude"]["field_excess"].to_numpy()
+    error = max(spread_of(excess[0] / 9.81), spread_of(excess[1]))
+    return gyro_output.suitable_stretch_s(
+        float(np.max(noise * np.abs(start.scale))), float(np.median(np.diff(t))), error
+    )
+
+
+def _triad_uncertainty(tables: Tables, s: Settings) -> list[tuple[Array, Array]]:
+    """[(directions sensed (n, 3) …)] see `propagation`: one (Jacobian of the attitude, covariance) pair per vector
+    triad."""
+    samples, attitude = tables["samples"], tables["attitude"]
+    axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    vectors = body_vectors(samples, known_vectors(tables, s), s, prefix="smoothed_")
+    spread = (
+        spread_of(attitude["field_excess"].to_numpy()),
+        spread_of(attitude["acceleration_excess_mps2"].to_numpy() / s["gravity_mps2"]),
+    )
+    sign = {"magnetometer": 1.0, "accelerometer": sensor.GRAVITY_SIGNS[s["gravity_sign"]]}
+    pairs = []
+    for i, name in enumerate(VECTOR_SENSORS):
+        covariance = tables.get(f"{name}_covariance")
+        if covariance is None or constants(tables[name], name) is None:
+            continue
+        logged = matrix(samples, triad(name, "smoothed_"))
+        jacobian = attitude_jacobian(vectors, np.array(spread), i, logged, sign[name] * axes)
+        pairs.append((np.einsum("ji,njp->nip", axes, jacobian), covariance_of(covariance)))
+    return pairs

@@ -1,0 +1,56 @@
+"""What several stages ask of their inputs: temperature, reference readings, derivatives by segment, refusals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal import smoothing
+from fieldcal.results import StageResult
+from fieldcal.rotation import Array
+from fieldcal.sensor import default_reference_reading
+
+Tables = Mapping[str, pl.DataFrame]
+
+
+Settings = Mapping[str, Any]
+
+
+def mean_temperature(tables: Tables) -> float | None:
+    """Mean logged temperature, °C, over the flight."""
+    table = tables.get("temperature")
+    return None if table is None or table.is_empty() else float(table["temperature_degc"].mean())  # type: ignore[arg-type]
+
+
+def reference_reading(s: Settings, name: str, logged: Array) -> Array:
+    configured = s["reference_reading"][name]
+    return default_reference_reading(logged, s["units"][name]) if configured is None else np.asarray(configured)
+
+
+def differentiate_by_segment(samples: pl.DataFrame, x: Array, window_s: float) -> Array:
+    """Local smoothed derivative of x (n, m) by segment."""
+    t_ns, segment = samples["t_ns"].to_numpy(), samples["segment"].to_numpy()
+    out = np.empty_like(x)
+    starts = np.flatnonzero(np.r_[True, segment[1:] != segment[:-1]])
+    for a, b in zip(starts, np.r_[starts[1:], len(segment)], strict=True):
+        out[a:b] = smoothing.differentiate_samples((t_ns[a:b] - t_ns[a]) * 1e-9, x[a:b], window_s=window_s)
+    return out
+
+
+def spread_of(excess: Array) -> float:
+    """Robust spread of a relative excess length: the direction noise to expect across it. At least 1e-4 rad."""
+    return max(float(1.4826 * np.median(np.abs(excess - np.median(excess)))), 1e-4)
+
+
+def refusal(error: Exception, name: str, measured: Mapping[str, Any] | None = None) -> StageResult:
+    """A refusal without a result, from whatever the numerics raised."""
+    code = getattr(error, "reason_code", "unusable_readings")
+    return StageResult(
+        status="refused",
+        reason_code=code,
+        reason=f"{name.capitalize()}: {error}",
+        measured={**(measured or {}), **getattr(error, "measured", {})},
+    )

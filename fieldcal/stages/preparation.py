@@ -1,0 +1,112 @@
+"""The first two stages: which stretches of the log to use, and their readings at one set of stamps, smoothed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal import manoeuvre, smoothing
+from fieldcal.frames import columns_of, matrix, seconds, triad
+from fieldcal.results import StageResult
+from fieldcal.rotation import Array
+from fieldcal.stages.inputs import Settings, Tables
+
+
+def find_manoeuvre(tables: Tables, s: Settings) -> StageResult:
+    """imu → segments: the stretches worth calibrating on, and why."""
+    imu = tables["imu"]
+    t = seconds(imu["t_ns"], imu["t_ns"][0])
+    rate = matrix(imu, triad("gyroscope"))
+    rate_or_none = None if np.isnan(rate).any() else rate
+    found = manoeuvre.select(
+        t,
+        rate_or_none,
+        window_s=s["manoeuvre_window_s"],
+        pad_s=s["manoeuvre_pad_s"],
+        rest_s=s["manoeuvre_rest_s"],
+        min_s=s["manoeuvre_min_s"],
+        max_gap_s=s["manoeuvre_max_gap_s"],
+        excited_ratio=s["manoeuvre_excited_ratio"],
+    )
+    stamps = imu["t_ns"].to_numpy()
+    segments = pl.DataFrame(
+        {
+            "segment": np.arange(len(found.segments), dtype=np.int32),
+            "start_ns": np.array([stamps[g.start] for g in found.segments], dtype=np.int64),
+            "end_ns": np.array([stamps[g.stop - 1] for g in found.segments], dtype=np.int64),
+            "n_samples": np.array([g.stop - g.start for g in found.segments], dtype=np.int64),
+            "rate_rms": np.array([g.rate_rms for g in found.segments], dtype=np.float64),
+            "used": [g.used for g in found.segments],
+            "reason": [g.reason for g in found.segments],
+        }
+    )
+    used_s = float(sum(t[g.stop - 1] - t[g.start] for g in found.segments if g.used))
+    measured = {
+        "excited_s": found.excited_s,
+        "used_s": used_s,
+        "log_s": float(t[-1] - t[0]),
+        "segments_used": int(sum(g.used for g in found.segments)),
+        "rate_level": found.level,
+        "rate_threshold": found.threshold,
+        "rate_noise": found.noise,
+    }
+    if found.excited_s < s["manoeuvre_min_s"]:
+        return StageResult(
+            {"segments": segments.with_columns(used=pl.lit(False))},
+            "refused",
+            "too_little_motion",
+            f"Only {found.excited_s:.1f} s of rotation were found, {s['manoeuvre_min_s']:.0f} s are needed: fly the"
+            " manoeuvre (roll, pitch and yaw doublets).",
+            measured,
+        )
+    return StageResult({"segments": segments}, measured=measured)
+
+
+def smooth(tables: Tables, s: Settings) -> StageResult:
+    """imu, magnetometer, segments → samples: readings of the used segments at the IMU's stamps, logged and smoothed."""
+    imu, segments = tables["imu"], tables["segments"].filter(pl.col("used"))
+    if segments.is_empty():
+        return StageResult(status="refused", reason_code="no_manoeuvre", reason="No segment of the log is usable.")
+    origin = int(imu["t_ns"][0])
+    stamps = imu["t_ns"].to_numpy()
+    logged = np.column_stack(
+        [matrix(imu, triad("gyroscope") + triad("accelerometer")), _magnetometer_at(tables, stamps)]
+    )
+    parts: list[dict[str, Any]] = []
+    for number, start, end in segments.select("segment", "start_ns", "end_ns").iter_rows():
+        rows = slice(int(np.searchsorted(stamps, start)), int(np.searchsorted(stamps, end, side="right")))
+        x = logged[rows]
+        t = (stamps[rows] - origin) * 1e-9
+        smoothed = np.full_like(x, np.nan)
+        known = ~np.isnan(x).any(axis=0)
+        smoothed[:, known] = smoothing.smooth_samples(
+            t, x[:, known], s["smoothing_cutoff_hz"], side_s=s["smoothing_side_s"], ends=s["smoothing_ends"]
+        )
+        parts.append({"t_ns": stamps[rows], "segment": np.full(len(x), number, dtype=np.int32), "x": x, "s": smoothed})
+    joined = {k: np.concatenate([p[k] for p in parts]) for k in ("t_ns", "segment", "x", "s")}
+    names = triad("gyroscope") + triad("accelerometer") + triad("magnetometer")
+    samples = pl.DataFrame(
+        {
+            "t_ns": joined["t_ns"],
+            "segment": joined["segment"],
+            **columns_of(joined["x"], names),
+            **columns_of(joined["s"], [f"smoothed_{n}" for n in names]),
+        }
+    ).with_columns(pl.selectors.float().fill_nan(None))
+    return StageResult({"samples": samples}, measured={"n_samples": len(samples)})
+
+
+def _magnetometer_at(tables: Tables, stamps: np.ndarray, longest_hold_s: float = 1.0) -> Array:
+    """Magnetometer at the IMU's stamps, (n, 3), linear between its own; NaN when there is none, or past its ends."""
+    magnetometer = tables.get("magnetometer")
+    if magnetometer is None or len(magnetometer) < 2:
+        return np.full((len(stamps), 3), np.nan)
+    own = magnetometer["t_ns"].to_numpy()
+    values = matrix(magnetometer, triad("magnetometer"))
+    if len(own) == len(stamps) and np.array_equal(own, stamps):
+        return values
+    origin = stamps[0]
+    at, known = (stamps - origin) * 1e-9, (own - origin) * 1e-9
+    return np.column_stack([np.interp(at, known, column) for column in values.T])

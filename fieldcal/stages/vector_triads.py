@@ -1,0 +1,203 @@
+"""Magnetometer and accelerometer: ellipsoid fits, the accelerometer's second pass, and their refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal import ellipsoid, manoeuvre, sensor
+from fieldcal.ellipsoid import TriadFit
+from fieldcal.errors import EstimationError, UnusableFlight
+from fieldcal.frames import calibration_rows, constants, covariance_table, matrix, seconds, triad
+from fieldcal.results import StageResult, triad_rows
+from fieldcal.rotation import Array
+from fieldcal.stages.attitude import logged_constants
+from fieldcal.stages.inputs import (
+    Settings,
+    Tables,
+    differentiate_by_segment,
+    mean_temperature,
+    reference_reading,
+    refusal,
+)
+
+ELLIPSOID_METHOD = {
+    "robust": "ellipsoid_robust",
+    "li": "ellipsoid",
+    "li_full": "ellipsoid_full",
+    "two_step": "ellipsoid_two_step",
+    "tls": "ellipsoid_tls",
+}
+
+
+GATE_FROM_RMS = 0.01
+
+
+REST_WINDOW_S = 0.5
+
+
+def calibrate_magnetometer(tables: Tables, s: Settings) -> StageResult:
+    """magnetometer, segments → calibration: hard iron and scale from the length of the local field."""
+    strength = float(np.linalg.norm(s["field_ned"]))
+    return _ellipsoid_stage(
+        "magnetometer", tables, s, strength, s["field_unit"], _used_readings(tables, "magnetometer")
+    )
+
+
+def calibrate_accelerometer(tables: Tables, s: Settings) -> StageResult:
+    """samples → calibration: first pass, every sample."""
+    return _ellipsoid_stage(
+        "accelerometer", tables, s, s["gravity_mps2"], "m/s^2", _used_readings(tables, "accelerometer")
+    )
+
+
+def _used_readings(tables: Tables, name: str) -> Array | None:
+    """Unsmoothed readings (n, 3) of the used segments at the sensor's own stamps; None when the log has none."""
+    if name == "magnetometer":
+        table = tables.get("magnetometer")
+        if table is None or table.is_empty():
+            return None
+        segments = tables["segments"].filter(pl.col("used"))
+        t = table["t_ns"].to_numpy()
+        inside = np.zeros(len(t), dtype=bool)
+        for start, end in segments.select("start_ns", "end_ns").iter_rows():
+            inside |= (t >= start) & (t <= end)
+        values = matrix(table, triad(name))[inside]
+    else:
+        values = matrix(tables["samples"], triad(name))
+    return None if len(values) == 0 or np.isnan(values).all() else values[np.isfinite(values).all(axis=1)]
+
+
+def _ellipsoid_stage(
+    name: str, tables: Tables, s: Settings, magnitude: float, unit: str, logged: Array | None
+) -> StageResult:
+    """Fit, judge, and write rows; a refused fit keeps its numbers."""
+    if logged is None:
+        return StageResult(status="refused", reason_code=f"no_{name}", reason=f"The log has no {name} readings.")
+    method = s["ellipsoid"]
+    source = logged if method == "robust" else _smoothed_or(tables, name, logged)
+    try:
+        fit = ellipsoid.fit_ellipsoid(source, magnitude, method=method, polarity=s["polarity"][name])
+    except (UnusableFlight, EstimationError, ValueError) as error:
+        return refusal(error, name)
+    return _judged(name, fit, tables, s, unit, logged, {})
+
+
+def _smoothed_or(tables: Tables, name: str, logged: Array) -> Array:
+    """Smoothed readings for the algebraic fits (their bias under noise is several per cent on raw counts)."""
+    samples = tables.get("samples")
+    if samples is None:
+        return logged
+    smoothed = matrix(samples, triad(name, "smoothed_"))
+    return logged if np.isnan(smoothed).any() else smoothed
+
+
+def _judged(
+    name: str, fit: TriadFit, tables: Tables, s: Settings, unit: str, logged: Array, extra: dict[str, Any]
+) -> StageResult:
+    """Rows of a triad fit, refused ones included, with the numbers that decided."""
+    code = reason = None
+    measured = {**fit.measured(), **extra}
+    try:
+        ellipsoid.require_determined(
+            fit,
+            max_condition=s["ellipsoid_max_condition"],
+            max_scale_sd=s["ellipsoid_max_scale_sd"],
+            max_residual=s["ellipsoid_max_residual"],
+            nominal_scale=s["nominal_scale"][name],
+        )
+    except UnusableFlight as refusal:
+        code, reason = refusal.reason_code, f"{name.capitalize()}: {refusal}"
+        measured |= refusal.measured
+    status = "ok" if code is None else "refused"
+    rows = triad_rows(
+        name,
+        ELLIPSOID_METHOD[s["ellipsoid"]],
+        fit.scale,
+        fit.bias,
+        fit.covariance,
+        unit=unit,
+        logged_unit=s["units"][name],
+        reference_reading=reference_reading(s, name, logged),
+        temperature_degc=mean_temperature(tables),
+        status=(status,) * 3,
+        reason_code=(code,) * 3,
+    )
+    result = {"calibration": calibration_rows(rows), "covariance": covariance_table(fit.covariance)}
+    return StageResult(result, status, code, reason, measured)
+
+
+def calibrate_accelerometer_gated(tables: Tables, s: Settings) -> StageResult:
+    """samples, first-pass constants and rates → calibration: second pass, lever arm taken out (Eq. 3), quiet samples
+    only.
+
+    Where the low-passed norm strays from g by more than 1 % rms something else than gravity was sensed: the gate
+    (norm near g, slow rotation) then applies if enough of the sphere remains behind it."""
+    samples = tables["samples"]
+    own = constants(tables["accelerometer"], "accelerometer") if "accelerometer" in tables else None
+    known = own or logged_constants(s, "accelerometer")
+    if known is None or samples["gyroscope_x"].null_count() or samples["accelerometer_x"].null_count():
+        kept = {"calibration": "accelerometer", "covariance": "covariance"}
+        return StageResult(
+            {name: tables[source] for name, source in kept.items() if source in tables},
+            "ok" if own is not None else "refused",
+            "first_pass_kept",
+            "Without a gyroscope or first constants there is no second pass: the first one stands.",
+        )
+    gyro = constants(tables["gyroscope"], "gyroscope") if "gyroscope" in tables else None
+    gyro = gyro or logged_constants(s, "gyroscope")
+    logged, smoothed = matrix(samples, triad("accelerometer")), matrix(samples, triad("accelerometer", "smoothed_"))
+    measured: dict[str, Any] = {"lever_arm_applied": s["lever_arm_m"] is not None and gyro is not None}
+    if gyro is None:
+        # Rates in counts: at rest, the one thing that can be told without a scale.
+        level, noise = manoeuvre.windowed_rate(
+            seconds(samples["t_ns"], samples["t_ns"][0]), matrix(samples, triad("gyroscope")), REST_WINDOW_S
+        )
+        slow = level < 4.0 * noise
+    else:
+        axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+        rate = sensor.calibrate(matrix(samples, triad("gyroscope", "smoothed_")), *gyro) @ axes.T
+        slow = np.linalg.norm(rate, axis=1) < s["gate_rate_radps"]
+        if s["lever_arm_m"] is not None:
+            arm = _lever_arm(samples, rate, s)
+            logged, smoothed = (
+                sensor.to_centre_of_mass(x, known[0], arm, axes, s["gravity_sign"]) for x in (logged, smoothed)
+            )
+    norm = np.linalg.norm(sensor.calibrate(smoothed, *known), axis=1) / s["gravity_mps2"]
+    quiet = (np.abs(norm - 1.0) < s["gate_norm"]) & slow
+    other = float(np.sqrt(np.mean((norm - 1.0) ** 2)))
+    measured |= {"gate_passed": int(quiet.sum()), "gate_share": float(quiet.mean()), "other_acceleration_rms_g": other}
+    method, polarity = s["ellipsoid"], s["polarity"]["accelerometer"]
+    source = logged if method == "robust" else smoothed
+    gated = _gated_fit(source, quiet, s) if other > GATE_FROM_RMS else None
+    measured["gate_kept"] = gated is not None
+    if gated is not None:
+        return _judged("accelerometer", gated, tables, s, "m/s^2", logged, measured)
+    try:
+        fit = ellipsoid.fit_ellipsoid(source, s["gravity_mps2"], method=method, polarity=polarity)
+    except (UnusableFlight, EstimationError, ValueError) as error:
+        return refusal(error, "accelerometer", measured)
+    return _judged("accelerometer", fit, tables, s, "m/s^2", logged, measured)
+
+
+def _gated_fit(source: Array, quiet: np.ndarray, s: Settings) -> TriadFit | None:
+    """Fit of the quiet samples; None where they see too little of the sphere."""
+    if quiet.sum() < 100:
+        return None
+    try:
+        fit = ellipsoid.fit_ellipsoid(
+            source[quiet], s["gravity_mps2"], method=s["ellipsoid"], polarity=s["polarity"]["accelerometer"]
+        )
+    except (UnusableFlight, EstimationError):
+        return None
+    doubt = float(np.max(np.sqrt(np.diagonal(fit.covariance)[:3]) / np.abs(fit.scale_diagonal)))
+    enough = fit.condition < s["ellipsoid_max_condition"] and doubt < s["ellipsoid_max_scale_sd"]
+    return fit if enough else None
+
+
+def _lever_arm(samples: pl.DataFrame, rate: Array, s: Settings) -> Array:
+    """Acceleration of the sensor about the centre of mass, m/s², body axes, from smoothed rates (Eq. 3)."""
+    rate_dot = differentiate_by_segment(samples, rate, s["differentiation_window_s"])
+    return sensor.lever_arm_acceleration(rate, rate_dot, s["lever_arm_m"])

@@ -1,0 +1,182 @@
+"""Synchronise the visual positioning system with the IMU and put it into the IMU's frames."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal import sensor, smoothing, sync
+from fieldcal.errors import UnusableFlight
+from fieldcal.frames import AXES, QUATERNION, columns_of, constants, matrix, seconds, triad
+from fieldcal.results import StageResult
+from fieldcal.rotation import (
+    Array,
+    body_from_inertial,
+    conjugate,
+    continuous,
+    from_matrix,
+    mean_quaternion,
+    multiply,
+    normalise,
+    slerp,
+)
+from fieldcal.stages.attitude import logged_constants
+from fieldcal.stages.inputs import Settings, Tables
+
+NED_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # rotation of ENU components to NED
+
+
+FLU_FRD = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+BRIDGE_S = 0.1  # IMU results are interpolated to VPS stamps only between samples this close
+
+
+RATE_COLUMNS = [f"rate_{axis}_radps" for axis in AXES]
+
+
+SYNC_NUMBERS = ("lag_s", "lag_mid_s", "lag_sd_s", "skew_ppm", "skew_sd_ppm", "peak", "runner_up")
+
+
+def synchronise_vps(tables: Tables, s: Settings) -> StageResult:
+    """imu, vps, gyroscope constants, attitude → sync, vps_aligned: the VPS on the IMU's clock and in its frames."""
+    if "vps" not in tables or tables["vps"].is_empty():
+        return StageResult(status="absent", reason_code="no_vps", reason="The log has no VPS.")
+    imu, vps = tables["imu"], tables["vps"]
+    logged = matrix(imu, triad("gyroscope"))
+    if np.isnan(logged).any():
+        return StageResult(status="refused", reason_code="no_gyroscope", reason="Synchronisation needs a gyroscope.")
+    gyro = _gyro_constants(tables, s)
+    axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    rate = (logged - np.median(logged, axis=0) if gyro is None else sensor.calibrate(logged, *gyro)) @ axes.T
+    origin = int(imu["t_ns"][0])
+    t_imu = seconds(imu["t_ns"], origin)
+    # Clocks of different epochs: their starts are laid together first, as integers.
+    base_ns = int(vps["t_ns"][0]) - origin
+    if abs(base_ns) * 1e-9 <= s["vps_max_lag_s"] + t_imu[-1]:
+        base_ns = 0
+    t_vps = seconds(vps["t_ns"], origin + base_ns)
+    q_vps = vps_attitude(matrix(vps, QUATERNION), s)
+    keep = sync.mask_outliers(t_vps, q_vps)
+    measured: dict[str, Any] = {
+        "vps_samples": len(keep),
+        "vps_masked": int((~keep).sum()),
+        "gyro_calibrated": gyro is not None,
+    }
+    t_vps, q_vps = t_vps[keep], q_vps[keep]
+    try:
+        fit = sync.synchronise(
+            t_imu,
+            rate,
+            t_vps,
+            q_vps,
+            max_lag_s=s["vps_max_lag_s"],
+            min_peak=s["vps_min_peak"],
+            max_gap_s=s["vps_max_gap_s"],
+        )
+    except UnusableFlight as error:
+        row = _sync_row(
+            {"status": "refused", "peak": error.measured.get("peak"), "runner_up": error.measured.get("runner_up")}
+        )
+        return StageResult({"sync": row}, "refused", error.reason_code, str(error), {**measured, **error.measured})
+    row = _sync_row(
+        {
+            "lag_s": fit.lag_s - base_ns * 1e-9,
+            "lag_mid_s": fit.lag_mid_s - base_ns * 1e-9,
+            "lag_sd_s": fit.lag_sd_s,
+            "skew_ppm": fit.skew_ppm,
+            "skew_sd_ppm": fit.skew_sd_ppm,
+            "peak": fit.peak,
+            "runner_up": fit.runner_up,
+            "status": "ok",
+        }
+    )
+    t_vps = fit.to_imu_clock(t_vps)
+    aligned, rotations = _aligned(t_vps, q_vps, t_imu, rate, tables, s, calibrated=gyro is not None)
+    measured |= rotations | {"peak_width_s": fit.peak_width_s}
+    t_ns = np.rint(aligned["t"] * 1e9).astype(np.int64) + origin
+    table = pl.DataFrame(
+        {"t_ns": t_ns, **columns_of(aligned["q"], QUATERNION), **columns_of(aligned["rate"], RATE_COLUMNS)}
+    )
+    return StageResult({"sync": row, "vps_aligned": table}, measured=measured)
+
+
+def _sync_row(values: dict[str, Any]) -> pl.DataFrame:
+    row = dict.fromkeys(SYNC_NUMBERS) | values
+    return pl.DataFrame([row], schema={**dict.fromkeys(SYNC_NUMBERS, pl.Float64), "status": pl.String})
+
+
+def _gyro_constants(tables: Tables, s: Settings) -> tuple[Array, Array] | None:
+    """Output error's constants, else equation error's, else what the logged unit says, else None."""
+    for method in ("output_error", "equation_error"):
+        own = constants(tables["gyroscope"], "gyroscope", method) if "gyroscope" in tables else None
+        if own is not None:
+            return own
+    return logged_constants(s, "gyroscope")
+
+
+def vps_attitude(q: Array, s: Settings) -> Array:
+    """Logged VPS attitudes, body to world, in the paper's NED and FRD; unit length, continuous."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        q = normalise(q)
+    if s["world"] == "enu":
+        q = multiply(NED_ENU, q)
+    if s["body"] == "flu":
+        q = multiply(q, FLU_FRD)
+    return q
+
+
+def _aligned(
+    t_vps: Array, q_vps: Array, t_imu: Array, rate: Array, tables: Tables, s: Settings, *, calibrated: bool
+) -> tuple[dict[str, Array], dict[str, Any]]:
+    """VPS attitude and rate on a uniform grid at its own rate, IMU clock, both constant rotations put in."""
+    interval = float(np.median(np.diff(t_vps)))
+    rates = sync.vps_rates(t_vps, q_vps, interval, max_gap_s=s["vps_max_gap_s"])
+    t = rates.t
+    inside = rates.valid & (t >= t_imu[0]) & (t <= t_imu[-1])
+    t, q, vps_rate = t[inside], slerp(t_vps, continuous(q_vps), t[inside]), rates.rate[inside]
+    own_rate = smoothing.low_pass(
+        np.column_stack([np.interp(t, t_imu, c) for c in rate.T]), sync.FINE_CUTOFF_HZ, interval
+    )
+    body = np.array([0.0, 0.0, 0.0, 1.0])
+    if calibrated:
+        smooth = smoothing.low_pass(vps_rate, sync.FINE_CUTOFF_HZ, interval)
+        # Vectors turn by R: ω_body = R ω_vps, and the attitude by the matching quaternion on the right.
+        body = conjugate(from_matrix(sync.rotation_between(smooth, own_rate)))
+        body = body if body[3] >= 0 else -body
+    q = multiply(q, body)
+    vps_rate = sensor_rotation(vps_rate, body)
+    world = np.array([0.0, 0.0, 0.0, 1.0])
+    if "attitude" in tables:
+        origin = int(tables["imu"]["t_ns"][0])
+        own_t = seconds(tables["attitude"]["t_ns"], origin)
+        own_q, near = interpolate_attitude(own_t, matrix(tables["attitude"], QUATERNION), t)
+        trust = np.interp(t, own_t, tables["attitude"]["weight"].to_numpy())
+        if near.any():
+            world = mean_quaternion(multiply(own_q[near], conjugate(q[near])), trust[near])
+            q = multiply(world, q)
+    rotations = {
+        "vps_body_rotation_deg": float(np.degrees(2 * np.arccos(np.clip(abs(body[3]), 0, 1)))),
+        "vps_world_rotation_deg": float(np.degrees(2 * np.arccos(np.clip(abs(world[3]), 0, 1)))),
+    }
+    return {"t": t, "q": continuous(q), "rate": vps_rate}, rotations
+
+
+def sensor_rotation(vectors: Array, q: Array) -> Array:
+    """Components of vectors (n, 3) in axes turned by q (4,): A(q) v."""
+    return vectors @ body_from_inertial(q).T
+
+
+def interpolate_attitude(t: Array, q: Array, at: Array) -> tuple[Array, np.ndarray]:
+    """Attitudes at times `at` (m,), and which of them lie between samples no more than 0.1 s apart."""
+    return slerp(t, q, at), bridged(t, at)
+
+
+def bridged(t: Array, at: Array) -> np.ndarray:
+    """Which times `at` lie between neighbouring stamps t no more than 0.1 s apart, (m,) bool."""
+    i = np.searchsorted(t, at, side="right") - 1
+    ok = (i >= 0) & (i < len(t) - 1)
+    i = np.clip(i, 0, len(t) - 2)
+    return ok & (t[i + 1] - t[i] <= BRIDGE_S)
