@@ -181,8 +181,8 @@ def _output_error(tables: Tables, s: Settings) -> StageResult:
         return StageResult(
             status="refused",
             reason_code="gyro_contradicts_attitude",
-            reason=f"The integrated gyroscope misses the attitude by {np.degrees(median):.0f}° (median): wrong polarity,"
-            " axes or units of a sensor, or attitudes spoiled by acceleration.",
+            reason=f"The integrated gyroscope misses the attitude by {np.degrees(median):.0f}° (median): wrong"
+            " polarity, axes or units of a sensor, or attitudes spoiled by acceleration.",
             measured=measured,
         )
     propagated = constants_to_gyro(t, q, segment, logged, weight, fit, stretch_s, _triad_uncertainty(tables, s))
