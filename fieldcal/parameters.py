@@ -48,8 +48,8 @@ PARAMETERS: dict[str, Parameter] = {
     "ellipsoid_max_residual": Parameter(
         0.10, "refuse above this rms residual, relative to the field", "1", bounds=(1e-3, 1.0)
     ),
-    "gate_norm": Parameter(0.03, "accelerometer gate: low-passed norm within this share of g", "1", bounds=(1e-3, 1.0)),
-    "gate_rate_radps": Parameter(1.0, "accelerometer gate: rotation rate below this", "rad/s", bounds=(0.01, 50.0)),
+    "gate_norm": Parameter(0.05, "accelerometer gate: low-passed norm within this share of g", "1", bounds=(1e-3, 1.0)),
+    "gate_rate_radps": Parameter(0.15, "accelerometer gate: rotation rate below this", "rad/s", bounds=(0.01, 50.0)),
     # attitude
     "attitude": Parameter(
         "quest", "attitude from two vectors", choices=("quest", "davenport", "svd", "triad", "euler")

@@ -110,7 +110,6 @@ PIPELINE: tuple[Stage, ...] = (
         {
             **SAMPLES,
             "accelerometer": "accelerometer.calibration",
-            "covariance": "accelerometer.covariance",
             "gyroscope": "gyro_equation.calibration",
         },
         ("samples",),

@@ -33,6 +33,7 @@ ELLIPSOID_METHOD = {
 
 
 GATE_FROM_RMS = 0.01
+PROVISIONAL = 0.5
 
 
 REST_WINDOW_S = 0.5
@@ -47,10 +48,16 @@ def calibrate_magnetometer(tables: Tables, s: Settings) -> StageResult:
 
 
 def calibrate_accelerometer(tables: Tables, s: Settings) -> StageResult:
-    """samples → calibration: first pass, every sample."""
-    return _ellipsoid_stage(
-        "accelerometer", tables, s, s["gravity_mps2"], "m/s^2", _used_readings(tables, "accelerometer")
-    )
+    """samples → calibration: first pass, every sample. Provisional: it only has to start the second pass, so its
+    limits are wide and, where the refinement finds no minimum, the algebraic fit stands in."""
+    wide = {**s, "ellipsoid_max_scale_sd": PROVISIONAL, "ellipsoid_max_residual": PROVISIONAL}
+    logged = _used_readings(tables, "accelerometer")
+    result = _ellipsoid_stage("accelerometer", tables, wide, s["gravity_mps2"], "m/s^2", logged)
+    if result.reason_code == "ellipsoid_diverged":
+        result = _ellipsoid_stage(
+            "accelerometer", tables, {**wide, "ellipsoid": "li"}, s["gravity_mps2"], "m/s^2", logged
+        )
+    return result
 
 
 def _used_readings(tables: Tables, name: str) -> Array | None:
@@ -139,15 +146,12 @@ def calibrate_accelerometer_gated(tables: Tables, s: Settings) -> StageResult:
     own = constants(tables["accelerometer"], "accelerometer") if "accelerometer" in tables else None
     known = own or logged_constants(s, "accelerometer")
     if known is None or samples["gyroscope_x"].null_count() or samples["accelerometer_x"].null_count():
-        kept = {"calibration": "accelerometer", "covariance": "covariance"}
-        return StageResult(
-            {name: tables[source] for name, source in kept.items() if source in tables},
-            "ok" if own is not None else "refused",
-            "first_pass_kept",
-            "Without a gyroscope or first constants there is no second pass: the first one stands.",
-        )
-    gyro = constants(tables["gyroscope"], "gyroscope") if "gyroscope" in tables else None
-    gyro = gyro or logged_constants(s, "gyroscope")
+        # Nothing to gate with: the first pass again, under the limits that count.
+        used = _used_readings(tables, "accelerometer")
+        return _ellipsoid_stage("accelerometer", tables, s, s["gravity_mps2"], "m/s^2", used)
+    gyro = logged_constants(s, "gyroscope")
+    if gyro is None and "gyroscope" in tables:
+        gyro = constants(tables["gyroscope"], "gyroscope", refused_too=True)
     logged, smoothed = matrix(samples, triad("accelerometer")), matrix(samples, triad("accelerometer", "smoothed_"))
     measured: dict[str, Any] = {"lever_arm_applied": s["lever_arm_m"] is not None and gyro is not None}
     if gyro is None:
@@ -171,15 +175,22 @@ def calibrate_accelerometer_gated(tables: Tables, s: Settings) -> StageResult:
     measured |= {"gate_passed": int(quiet.sum()), "gate_share": float(quiet.mean()), "other_acceleration_rms_g": other}
     method, polarity = s["ellipsoid"], s["polarity"]["accelerometer"]
     source = logged if method == "robust" else smoothed
-    gated = _gated_fit(source, quiet, s) if other > GATE_FROM_RMS else None
-    measured["gate_kept"] = gated is not None
-    if gated is not None:
-        return _judged("accelerometer", gated, tables, s, "m/s^2", logged, measured)
+    refused: Exception | None = None
     try:
         fit = ellipsoid.fit_ellipsoid(source, s["gravity_mps2"], method=method, polarity=polarity)
     except (UnusableFlight, EstimationError, ValueError) as error:
-        return refusal(error, "accelerometer", measured)
-    return _judged("accelerometer", fit, tables, s, "m/s^2", logged, measured)
+        fit, refused = None, error
+    gated = _gated_fit(source, quiet, s) if other > GATE_FROM_RMS else None
+    measured["gate_kept"] = gated is not None and (fit is None or _scale_doubt(gated) < _scale_doubt(fit))
+    chosen = gated if measured["gate_kept"] else fit
+    if chosen is None:
+        return refusal(refused or ValueError("no fit"), "accelerometer", measured)
+    return _judged("accelerometer", chosen, tables, s, "m/s^2", logged, measured)
+
+
+def _scale_doubt(fit: TriadFit) -> float:
+    """Largest claimed relative sd of a scale."""
+    return float(np.max(np.sqrt(np.diagonal(fit.covariance)[:3]) / np.abs(fit.scale_diagonal)))
 
 
 def _gated_fit(source: Array, quiet: np.ndarray, s: Settings) -> TriadFit | None:
@@ -192,8 +203,7 @@ def _gated_fit(source: Array, quiet: np.ndarray, s: Settings) -> TriadFit | None
         )
     except (UnusableFlight, EstimationError):
         return None
-    doubt = float(np.max(np.sqrt(np.diagonal(fit.covariance)[:3]) / np.abs(fit.scale_diagonal)))
-    enough = fit.condition < s["ellipsoid_max_condition"] and doubt < s["ellipsoid_max_scale_sd"]
+    enough = fit.condition < s["ellipsoid_max_condition"]
     return fit if enough else None
 
 
