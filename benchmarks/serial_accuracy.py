@@ -2,8 +2,9 @@
 
     python benchmarks/serial_accuracy.py [--flights 32] [--first-seed 1000] [--translation-rms 0] [--dip-deg 0]
 
-Prints one Markdown table: scale error (rms of three axes, per cent) and attitude error (rms, degrees, against the truth delayed by
-the sensor filter) as median and 95th percentile over flights, and the RMS of error ÷ claimed sd of the scales. `--json` prints the figures.
+Prints one Markdown table: scale error (rms of three axes, per cent) and attitude error (rms, degrees, against the
+truth delayed by the sensor filter) as median and 95th percentile over flights, and the RMS of error ÷ claimed sd of
+the scales. `--json` prints the figures.
 """
 
 from __future__ import annotations
