@@ -114,6 +114,14 @@ def estimate_attitude(tables: Tables, s: Settings) -> StageResult:
             " number: a wrong polarity, swapped axes, or a magnet on board.",
             measured=measured,
         )
+    if abs(expected_dip) > 20.0 and abs(measured["dip_deg"] + expected_dip) < 15.0:
+        return StageResult(
+            status="refused",
+            reason_code="gravity_sign_contradiction",
+            reason=f"The sensed field dips by {measured['dip_deg']:.0f}° where {expected_dip:.0f}° is configured:"
+            f' gravity_sign "{s["gravity_sign"]}" (or the polarity of a whole triad) is the wrong way round.',
+            measured=measured,
+        )
     table = pl.DataFrame(
         {
             "t_ns": tables["samples"]["t_ns"],

@@ -143,9 +143,8 @@ def _aligned(
     body = np.array([0.0, 0.0, 0.0, 1.0])
     if calibrated:
         smooth = smoothing.low_pass(vps_rate, sync.FINE_CUTOFF_HZ, interval)
-        # Vectors turn by R: ω_body = R ω_vps, and the attitude by the matching quaternion on the right.
-        body = conjugate(from_matrix(sync.rotation_between(smooth, own_rate)))
-        body = body if body[3] >= 0 else -body
+        # ω_body = R ω_vps: components turn by A(body) = R, the attitude by the same quaternion on the right.
+        body = from_matrix(sync.rotation_between(smooth, own_rate))
     q = multiply(q, body)
     vps_rate = sensor_rotation(vps_rate, body)
     world = np.array([0.0, 0.0, 0.0, 1.0])
