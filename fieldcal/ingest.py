@@ -154,8 +154,8 @@ class TidySignal:
             yield Finding(
                 "clock_reset",
                 self.reset,
-                f"{name}: the stamps of {table} step back by {self.largest_step_back_ns * 1e-9:.3f} s into time that is "
-                f"recorded already ({self.reset} rows): the clock was reset. Split the log where it was.",
+                f"{name}: the stamps of {table} step back by {self.largest_step_back_ns * 1e-9:.3f} s into time "
+                f"that is recorded already ({self.reset} rows): the clock was reset. Split the log where it was.",
                 fatal=sensors,
             )
         elif self.disordered:
@@ -207,6 +207,7 @@ class TidyLog:
         self._signals: dict[str, TidySignal] = {}
         self._temperature: list[float] | None = None
         self._position = np.zeros(3)
+        self._read_through = False
 
     def tables(self) -> Iterator[tuple[str, pl.DataFrame]]:
         """Tidy rows, (signal table, frame), each table in order of time.
@@ -222,6 +223,7 @@ class TidyLog:
             signal = self._signals.setdefault(table, TidySignal(table, self._held_rows))
             for frame in signal.add(columns):
                 yield table, self._seen(table, frame)
+        self._read_through = True
         for table, signal in self._signals.items():
             for frame in signal.finish():
                 yield table, self._seen(table, frame)
@@ -232,6 +234,10 @@ class TidyLog:
                 + "".join(f" ({finding.sentence})" for finding in self._findings()[:1])
                 + ". Check the topics or columns in fieldcal.toml.",
             )
+
+    def units(self) -> dict[str, str] | None:
+        """Unit per sensor; None while the log may still say otherwise."""
+        return dict(self._reader.summary.units) if self._read_through else None
 
     def _seen(self, table: str, frame: pl.DataFrame) -> pl.DataFrame:
         if table == "temperature":
@@ -277,6 +283,14 @@ def tidy_log(path: Path, vehicle: Vehicle, *, whole: bool = False) -> TidyLog:
     return TidyLog(open_log(path, vehicle), path.name, whole=whole)
 
 
+def logged_units(path: Path, vehicle: Vehicle) -> dict[str, str]:
+    """Unit per sensor, from a pass through the whole log: what long logs need whose word on it may come last."""
+    reader = open_log(path, vehicle)
+    for _ in reader.batches():
+        pass
+    return dict(reader.summary.units)
+
+
 def declared(summary: LogSummary) -> dict[str, Any]:
     """What the log says of itself."""
     return {
@@ -316,7 +330,7 @@ def rejected(reason_code: str, reason: str) -> dict[str, Any]:
 
 
 def read_flight(path: Path, vehicle: Vehicle) -> tuple[dict[str, pl.DataFrame], dict[str, Any]]:
-    """A whole log in memory: signal table → tidy frame, and the facts. An unreadable log is `rejected`, without tables."""
+    """A whole log in memory: signal table → tidy frame, and the facts. Unreadable: `rejected`, no tables."""
     for whole in (False, True):
         frames: dict[str, list[pl.DataFrame]] = {}
         try:

@@ -1,0 +1,103 @@
+"""What a night has to look at: the logs, what they are, which are copies, and whose settings apply."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from fieldcal.configuration import Configuration, load, parse
+from fieldcal.errors import ConfigurationError
+from fieldcal.logs import LogFile, find_logs, flight_id, log_sha256
+
+CONFIG_NAME = "fieldcal.toml"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One log of the night, plain values only. `problem`: why its content could not even be hashed."""
+
+    path: str
+    log_uri: str
+    vehicle_id: str
+    session_id: str
+    log_format: str
+    sha256: str | None
+    flight_id: str
+    stamp: tuple[int, ...] = ()
+    problem: str | None = None
+
+    def plain(self) -> dict[str, Any]:
+        """Plain JSON; `Job(**plain)` is the job again."""
+        return {**asdict(self), "stamp": list(self.stamp)}
+
+
+Source = dict[str, str | None]
+"""Path and text of a configuration file, as plain JSON: what was read once holds for the whole night."""
+
+
+def find_source(config: Path | None, archive: Path | None) -> Source:
+    """The configuration named, else the archive's own at its root, else none (the defaults).
+
+    Raises
+    ------
+    ConfigurationError
+        The file is wrong, or the named one is not there.
+    """
+    path = config
+    if path is None and archive is not None and (archive / CONFIG_NAME).is_file():
+        path = archive / CONFIG_NAME
+    if path is None:
+        return {"path": None, "text": ""}
+    if not path.is_file():
+        raise ConfigurationError("config_not_readable", f"{path}: there is no such file.")
+    load(path)
+    return {"path": str(path), "text": path.read_bytes().decode("utf-8-sig")}
+
+
+def configuration_of(source: Source) -> Configuration:
+    """The configuration from its source."""
+    return parse(source["text"] or "", Path(source["path"]) if source["path"] else None)
+
+
+def find_jobs(archive: Path, configuration: Configuration, session: Path | None = None) -> list[Job]:
+    """All logs of an archive, or of one session folder of it, hashed, in the order of their place."""
+    logs: Iterable[LogFile] = find_logs(archive, configuration.logs)
+    if session is not None:
+        inside = session.resolve()
+        logs = (log for log in logs if log.path.resolve().is_relative_to(inside))
+    return [_job(log) for log in logs]
+
+
+def file_stamp(path: Path) -> tuple[int, ...]:
+    """Sizes and times of change of a log's files: differs when somebody still writes it."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    return tuple(value for file in files for value in (file.stat().st_size, file.stat().st_mtime_ns))
+
+
+def _job(log: LogFile) -> Job:
+    known = (str(log.path), log.log_uri, log.vehicle_id, log.session_id, log.log_format)
+    try:
+        stamp = file_stamp(log.path)
+        sha256 = log_sha256(log.path)
+    except OSError as error:
+        stand_in = flight_id(hashlib.sha256(f"unreadable\0{log.log_uri}".encode()).hexdigest())
+        why = f"{log.log_uri} cannot be read ({error.strerror}). Check its permissions."
+        return Job(*known, None, stand_in, problem=why)
+    return Job(*known, sha256, flight_id(sha256), stamp)
+
+
+def without_copies(jobs: list[Job], known: dict[str, str], present: set[str]) -> tuple[list[Job], dict[str, str]]:
+    """Jobs to look at, and for each copy (by log_uri) the log_uri of the log it is a copy of.
+
+    The first is the one the history knows (`known`: flight_id → log_uri), while it is still `present` in the archive;
+    else the one whose place sorts first.
+    """
+    first: dict[str, str] = {}
+    for job in jobs:
+        recorded = known.get(job.flight_id)
+        first.setdefault(job.flight_id, recorded if recorded in present else job.log_uri)
+    kept = [job for job in jobs if first[job.flight_id] == job.log_uri]
+    return kept, {job.log_uri: first[job.flight_id] for job in jobs if first[job.flight_id] != job.log_uri}

@@ -1,0 +1,117 @@
+"""Rows of the history tables from what the steps recorded."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import polars as pl
+
+import schemas
+from fieldcal import ingest
+from fieldcal.pipeline import PUBLISHED
+from flows.jobs import Job
+from warehouse.store import empty_frame, frame
+
+FACTS = (
+    "duration_s",
+    "imu_rate_hz",
+    "vps_rate_hz",
+    "n_samples",
+    "temperature_min_degc",
+    "temperature_mean_degc",
+    "temperature_max_degc",
+    "verdict",
+    "reason_code",
+    "reason",
+    "verifiable",
+)
+LEAD = ("flight_id", "vehicle_id", "imu_id", "session_id", "started_at")
+
+
+def lead(job: Job, imu_id: str, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """What leads every row of the history."""
+    return {
+        "flight_id": job.flight_id,
+        "vehicle_id": job.vehicle_id,
+        "imu_id": imu_id,
+        "session_id": job.session_id,
+        "started_at": ingest.started_at(facts),
+    }
+
+
+def flight_row(job: Job, leading: Mapping[str, Any], facts: Mapping[str, Any]) -> dict[str, Any]:
+    """The row of `flight`."""
+    return {
+        **leading,
+        "log_uri": job.log_uri,
+        "log_sha256": job.sha256,
+        "log_format": job.log_format,
+        **{name: facts[name] for name in FACTS},
+        "findings": _json(facts["findings"]),
+    }
+
+
+def run_rows(leading: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of `run`, one a step. The sentence of a refusal stands among the measured numbers, as `reason`."""
+    return [
+        {
+            **leading,
+            "stage": step,
+            "status": record["status"],
+            "reason_code": record["reason_code"],
+            "measured": _json({**record["measured"], **({"reason": record["reason"]} if record["reason"] else {})}),
+            "run_key": record["run_key"],
+            "versions": _json(record["versions"]),
+        }
+        for step, record in records.items()
+    ]
+
+
+def judged(facts: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """The facts with the verdict of the whole flight: a stage that failed makes an `ok` log `partial`."""
+    failed = [record for record in records.values() if record["status"] == "failed"]
+    if facts["verdict"] == "ok" and failed:
+        return {**facts, "verdict": "partial", "reason_code": failed[0]["reason_code"], "reason": failed[0]["reason"]}
+    return dict(facts)
+
+
+def refusals(records: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Stages that refused or failed, with code and sentence."""
+    return [
+        {"stage": step, "status": record["status"], "reason_code": record["reason_code"], "reason": record["reason"]}
+        for step, record in records.items()
+        if record["status"] in ("refused", "failed")
+    ]
+
+
+def published_tables(
+    leading: Mapping[str, Any], tables: Mapping[str, tuple[pl.DataFrame, str | None]]
+) -> dict[str, pl.DataFrame]:
+    """`calibration`, `fit` and `sync` of one flight from `stage.table` → (frame, run_key)."""
+    result = {}
+    for table, sources in PUBLISHED.items():
+        parts = [
+            frame.with_columns(
+                *(pl.lit(value).alias(name) for name, value in leading.items() if name != "started_at"),
+                pl.lit(leading["started_at"], dtype=pl.Datetime("us", "UTC")).alias("started_at"),
+                pl.lit(run_key, dtype=pl.String).alias("run_key"),
+            )
+            for frame, run_key in (tables[name] for name in sources if name in tables)
+        ]
+        columns = [column.name for column in schemas.table_columns(table)]
+        result[table] = (
+            pl.concat([part.select(columns) for part in parts], how="vertical") if parts else empty_frame(table)
+        )
+    return result
+
+
+def rows_frame(table: str, rows: list[dict[str, Any]]) -> pl.DataFrame:
+    """Rows as a typed frame of `table`."""
+    empty = frame(schemas.arrow_schema(table).empty_table())
+    return pl.DataFrame(rows, schema=empty.schema, strict=False) if rows else empty
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, ensure_ascii=False, allow_nan=False)
