@@ -11,6 +11,9 @@ from fieldcal.rotation import Array
 from fieldcal.statistics import MAD_TO_SIGMA
 
 
+REST_SHARE = 0.02  # of the sustained level: slower is rest
+
+
 @dataclass(frozen=True)
 class Segment:
     """Samples [start, stop) of the log; `rate_rms` in logged gyroscope units; `used` and why (not)."""
@@ -110,7 +113,8 @@ def select(
     level = float(np.partition(level_of, len(t) - sustained)[len(t) - sustained])
     threshold = max(excited_ratio * level, 4.0 * noise)
     excited = level_of > threshold
-    moving = level_of > max(0.02 * level, 4.0 * noise)
+    # Rest that the sensor's own noise hides is of no use: integrating it only adds the noise.
+    moving = level_of > REST_SHARE * level
     segments: list[Segment] = []
     excited_s = 0.0
     for a, b in stretches:
