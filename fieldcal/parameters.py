@@ -68,7 +68,7 @@ PARAMETERS: dict[str, Parameter] = {
         bounds=(0.0, 1e5),
     ),
     "gyro_max_scale_sd": Parameter(
-        0.03, "refuse above this relative standard deviation of a gyroscope scale", "1", bounds=(1e-4, 1.0)
+        0.05, "refuse above this relative standard deviation of a gyroscope scale", "1", bounds=(1e-4, 1.0)
     ),
     # visual positioning system
     "use_vps": Parameter(False, "use the VPS attitude in the estimate (method joint)"),
