@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from fieldcal.configuration import Configuration, load, parse
+from fieldcal.configuration import Configuration, Vehicle, load, parse
 from fieldcal.errors import ConfigurationError
 from fieldcal.logs import LogFile, find_logs, flight_id, log_sha256
 
@@ -101,3 +102,35 @@ def without_copies(jobs: list[Job], known: dict[str, str], present: set[str]) ->
         first.setdefault(job.flight_id, recorded if recorded in present else job.log_uri)
     kept = [job for job in jobs if first[job.flight_id] == job.log_uri]
     return kept, {job.log_uri: first[job.flight_id] for job in jobs if first[job.flight_id] != job.log_uri}
+
+
+def with_parameters(vehicle: Vehicle, profile: str | None, changes: Mapping[str, str]) -> Vehicle:
+    """A vehicle with a profile's presets and single parameters (name → text) laid over its own.
+
+    Raises
+    ------
+    ConfigurationError
+        An unknown name (the nearest known one is told) or a value that is not allowed.
+    """
+    lines = ["[defaults]"]
+    if profile is not None:
+        lines.append(f"profile = {json.dumps(profile)}")
+    lines.append("[defaults.parameters]")
+    lines += [f"{json.dumps(name)} = {_toml_value(text)}" for name, text in changes.items()]
+    given = parse("\n".join(lines), Path("command line")).vehicle(vehicle.vehicle_id)
+    over = {name: given.parameters[name] for name in changes}
+    base = dict(vehicle.parameters)
+    if profile is not None:
+        base |= {name: value for name, value in given.parameters.items() if name not in changes}
+    return replace(vehicle, profile=profile or vehicle.profile, parameters={**base, **over})
+
+
+def _toml_value(text: str) -> str:
+    """Text of a parameter as TOML: numbers and true/false as they are, the rest quoted."""
+    if text in ("true", "false"):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return json.dumps(text)
+    return text

@@ -49,7 +49,7 @@ def dry_run(archive: Path, root: Path, config: Path | None, session: Path | None
     from flows.plan import make_plan
 
     plan = make_plan(root, archive, configuration_of(find_source(config, archive)), session)
-    logs = [
+    logs: list[dict[str, Any]] = [
         {
             "log_uri": job.log_uri,
             "flight_id": job.flight_id,

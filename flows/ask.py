@@ -1,0 +1,71 @@
+"""Questions to the history that have a command of their own."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import polars as pl
+
+from fieldcal.errors import FieldcalError
+from warehouse import Warehouse, WarehouseError
+
+COLUMNS = (
+    "started_at",
+    "vehicle_id",
+    "imu_id",
+    "session_id",
+    "flight_id",
+    "sensor",
+    "method",
+    "parameter",
+    "axis",
+    "value",
+    "sd",
+    "unit",
+    "temperature_degc",
+    "status",
+    "reason_code",
+)
+
+
+def calibration_history(
+    root: Path, vehicle: str | None, sensor: str | None, parameter: str | None, since: str | None
+) -> pl.DataFrame:
+    """Rows of `calibration`, oldest flight first, flights of unknown time at the end."""
+    rows = existing(root).scan("calibration", vehicle_id=vehicle)
+    for column, wanted in (("sensor", sensor), ("parameter", parameter)):
+        if wanted is not None:
+            rows = rows.filter(pl.col(column) == wanted)
+    if since is not None:
+        rows = rows.filter(pl.col("started_at") >= _moment(since))
+    order = ["started_at", "vehicle_id", "flight_id", "sensor", "method", "parameter", "axis"]
+    return rows.select(COLUMNS).sort(order, nulls_last=True).collect()
+
+
+def answer(root: Path, query: str) -> pl.DataFrame:
+    """One SELECT over the tables and views."""
+    return existing(root).sql(query)
+
+
+def existing(root: Path) -> Warehouse:
+    """The warehouse at `root`.
+
+    Raises
+    ------
+    WarehouseError
+        `no_warehouse`.
+    """
+    if not root.is_dir():
+        raise WarehouseError(
+            "no_warehouse", f"There is no warehouse at {root}; run `fieldcal nightly` or give --warehouse."
+        )
+    return Warehouse(root)
+
+
+def _moment(text: str) -> datetime:
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise FieldcalError("wrong_option", f'--since needs a date such as 2026-05-04, not "{text}".') from error
+    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)

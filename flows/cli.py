@@ -1,0 +1,328 @@
+"""The command line: `fieldcal`. What each command does lies in the modules that it imports when it runs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import App, CycloptsError, Parameter
+
+import fieldcal
+from flows.cli_simulate import simulate
+from flows.interrupt import interruptible
+
+OK, FAILED, USAGE, LOSSES, BUSY, INTERRUPTED = 0, 1, 2, 3, 75, 130
+USAGE_CODES = ("not_found", "no_archive", "no_session", "sql_refused", "sql_wrong", "wrong_option")
+
+app = App(
+    name="fieldcal",
+    help="Field calibration of inertial sensors from flight logs.",
+    version=fieldcal.__version__,
+    result_action="return_value",
+    help_format="plaintext",
+)
+
+Config = Annotated[Path | None, Parameter(help="fieldcal.toml to use; else the archive's own, if it has one.")]
+Root = Annotated[
+    Path | None, Parameter(name="--warehouse", help="Data root; else FIELDCAL_WAREHOUSE, else ./fieldcal-data.")
+]
+AsJson = Annotated[bool, Parameter(name="--json", negative="", help="One JSON document on stdout.")]
+AsCsv = Annotated[bool, Parameter(name="--csv", negative="", help="CSV on stdout.")]
+DryRun = Annotated[bool, Parameter(negative="", help="List what would run; change nothing.")]
+Workers = Annotated[int, Parameter(help="Processes that calibrate; results do not depend on it.")]
+
+
+@app.command
+def demo(folder: Path = Path("fieldcal-demo"), /, *, warehouse: Root = None, config: Config = None) -> int:
+    """Simulate a small fleet flying the paper's manoeuvre, run the night, show the result.
+
+    Parameters
+    ----------
+    folder
+        Where logs and results go.
+    """
+    from flows.demo import run_demo
+
+    return LOSSES if run_demo(folder, warehouse or folder / "fieldcal-data", config) else OK
+
+
+@app.command
+def calibrate(
+    log: Path,
+    /,
+    *,
+    vehicle: str | None = None,
+    method: Annotated[Literal["serial"], Parameter(show_choices=True)] = "serial",
+    profile: Literal["full", "onboard", "paper"] | None = None,
+    set_: Annotated[list[str] | None, Parameter(name="--set", negative="")] = None,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Calibrate one log: parameters with their standard deviations, agreement, verdict. Nothing is stored.
+
+    Parameters
+    ----------
+    log
+        An MCAP or CSV file, or a folder with imu.csv.
+    vehicle
+        The vehicle in fieldcal.toml; else the folder two levels above the log.
+    method
+        How the sensors are calibrated.
+    profile
+        Presets of the stages.
+    set_
+        Overrule a stage parameter: --set smoothing_cutoff_hz=6.
+    """
+    from flows.calibrate import calibrate_log
+    from flows.show import console, print_json
+
+    document = calibrate_log(log, config, vehicle_id=vehicle, profile=profile, changes=_assignments(set_ or []))
+    if as_json:
+        print_json(document)
+    else:
+        from flows.present_flight import print_flight
+
+        print_flight(console(), document)
+    return OK if document["flight"]["verdict"] == "ok" else LOSSES
+
+
+@app.command
+def nightly(
+    archive: Path,
+    /,
+    *,
+    workers: Workers = 1,
+    dry_run: DryRun = False,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Calibrate every new or changed log of an archive and publish the results.
+
+    Parameters
+    ----------
+    archive
+        Folder of logs: ARCHIVE/<vehicle>/<session>/<log>.
+    """
+    _need_folder(archive, "no_archive", "archive")
+    return _night(archive.absolute(), None, workers, dry_run, as_json, warehouse, config)
+
+
+@app.command
+def session(
+    folder: Annotated[Path, Parameter(name="SESSION_DIR")],
+    /,
+    *,
+    workers: Workers = 1,
+    dry_run: DryRun = False,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """The same as the night for one field session, now.
+
+    Parameters
+    ----------
+    folder
+        Folder of the session: ARCHIVE/<vehicle>/<session>.
+    """
+    _need_folder(folder, "no_session", "session folder")
+    own = folder.absolute()
+    return _night(own.parent.parent, own, workers, dry_run, as_json, warehouse, config)
+
+
+@app.command
+def history(
+    *,
+    vehicle: str | None = None,
+    sensor: Literal["magnetometer", "accelerometer", "gyroscope"] | None = None,
+    parameter: str | None = None,
+    since: str | None = None,
+    as_json: AsJson = False,
+    as_csv: AsCsv = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Calibrated parameters, flight by flight.
+
+    Parameters
+    ----------
+    vehicle, sensor
+        Only these.
+    parameter
+        scale, bias, zero or zero_bias.
+    since
+        Only flights that started then or later: 2026-05-04 or 2026-05-04T12:00.
+    """
+    from flows.ask import calibration_history
+    from flows.show import print_frame
+
+    rows = calibration_history(_root(warehouse), vehicle, sensor, parameter, since)
+    print_frame(rows, as_json=as_json, as_csv=as_csv)
+    return OK
+
+
+@app.command
+def sql(
+    query: str, /, *, as_json: AsJson = False, as_csv: AsCsv = False, warehouse: Root = None, config: Config = None
+) -> int:
+    """Answer one SELECT over the tables and views; it can only read.
+
+    Parameters
+    ----------
+    query
+        "SELECT …"
+    """
+    from flows.ask import answer
+    from flows.show import print_frame
+
+    print_frame(answer(_root(warehouse), query), as_json=as_json, as_csv=as_csv)
+    return OK
+
+
+@app.command
+def verify(
+    *,
+    archive: Path | None = None,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Check every stored file against its recorded sha256.
+
+    Parameters
+    ----------
+    archive
+        Check the logs of this archive too.
+    """
+    from fieldcal.logs import log_sha256
+    from flows.show import print_json, say
+    from warehouse.verify import verify as check
+
+    if archive is not None:
+        _need_folder(archive, "no_archive", "archive")
+    result = check(_root(warehouse), archive, log_sha256)
+    if as_json:
+        print_json(result)
+    else:
+        for damage in result["damaged"]:
+            print(f"{damage['path']}: {damage['reason']}")
+        say(f"{result['files']} files checked, {len(result['damaged'])} damaged")
+        print(f"content_sha256 {result['content_sha256'] or 'unknown: tables are damaged'}")
+    return OK if result["ok"] else FAILED
+
+
+def main(tokens: Sequence[str] | None = None) -> None:
+    """Run the command line and exit with its code."""
+    sys.exit(run(sys.argv[1:] if tokens is None else tokens))
+
+
+def run(tokens: Sequence[str]) -> int:
+    """Run one command; its exit code. Errors are one sentence on stderr, unless FIELDCAL_DEBUG=1."""
+    try:
+        with interruptible():
+            code: Any = app(list(tokens), exit_on_error=False, print_error=False)
+        sys.stdout.flush()
+        return OK if code is None else int(code)
+    except CycloptsError as error:
+        return _told(f"{' '.join(str(error).split())} (fieldcal --help)", USAGE)
+    except KeyboardInterrupt:
+        return _told("Interrupted; what is done is kept, the next run goes on from there.", INTERRUPTED)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    except Exception as error:
+        if os.environ.get("FIELDCAL_DEBUG") == "1":
+            raise
+        return _explained(error)
+
+
+def _explained(error: Exception) -> int:
+    from fieldcal.errors import ConfigurationError, FieldcalError
+
+    if isinstance(error, ConfigurationError):
+        return _told(error.sentence, USAGE)
+    if isinstance(error, FieldcalError):
+        code = BUSY if error.reason_code == "busy" else USAGE if error.reason_code in USAGE_CODES else FAILED
+        return _told(error.sentence, code)
+    if isinstance(error, OSError) and error.filename is not None:
+        return _told(f"{error.filename}: {error.strerror}.", FAILED)
+    told = " ".join(str(error).split())
+    return _told(f"{type(error).__name__}: {told} (FIELDCAL_DEBUG=1 shows where).", FAILED)
+
+
+def _told(sentence: str, code: int) -> int:
+    print(f"fieldcal: {sentence}", file=sys.stderr)
+    return code
+
+
+def _night(
+    archive: Path,
+    folder: Path | None,
+    workers: int,
+    dry: bool,
+    as_json: bool,
+    warehouse: Path | None,
+    config: Path | None,
+) -> int:
+    from flows.night import dry_run as plan_only
+    from flows.night import run_night
+    from flows.show import console, print_json
+
+    if workers < 1:
+        raise _usage("wrong_option", "--workers must be 1 or more.")
+    root = _root(warehouse)
+    if dry:
+        plan = plan_only(archive, root, config, folder)
+        if as_json:
+            print_json(plan)
+        else:
+            from flows.present_night import print_plan
+
+            print_plan(console(), plan)
+        return OK
+    from flows.present_night import NightProgress, print_night
+
+    with NightProgress() as progress:
+        result = run_night(archive, root, config, folder, workers, progress)
+    if as_json:
+        print_json(result)
+    else:
+        print_night(console(), result, root)
+    return OK if result["ok"] == len(result["logs"]) else LOSSES
+
+
+def _root(warehouse: Path | None) -> Path:
+    from warehouse import Warehouse
+
+    return Warehouse(warehouse).root
+
+
+def _need_folder(folder: Path, reason_code: str, what: str) -> None:
+    if not folder.is_dir():
+        raise _usage(reason_code, f"There is no {what} at {folder}.")
+
+
+def _usage(reason_code: str, sentence: str) -> Exception:
+    from fieldcal.errors import FieldcalError
+
+    return FieldcalError(reason_code, sentence)
+
+
+def _assignments(texts: list[str]) -> dict[str, str]:
+    """["name=value", …] as a dictionary."""
+    pairs = [text.partition("=") for text in texts]
+    for name, equals, _ in pairs:
+        if not equals or not name:
+            raise _usage("wrong_option", f'--set needs name=value, not "{name}".')
+    return {name.strip(): value.strip() for name, _, value in pairs}
+
+
+app.command(simulate)
+
+if __name__ == "__main__":
+    main()

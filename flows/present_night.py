@@ -1,0 +1,122 @@
+"""A night on the terminal: progress while it runs, and the table that closes it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+from rich.console import Console
+
+from flows.present_flight import is_consequence
+from flows.show import cell, say, table
+from warehouse import Warehouse
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from flows.outcome import Outcome
+
+WORST = 5
+REFUSALS = 12
+
+
+class NightProgress:
+    """Tells of each flight as it is done: a bar with the time remaining on a terminal, else a line a log, on stderr."""
+
+    def __init__(self) -> None:
+        self._bar: Progress | None = None
+        self._task: Any = None
+        self._total = 0
+        self._done = 0
+
+    def planned(self, flights: int, missing: int) -> None:
+        """The night knows what it has to do."""
+        self._total = flights
+        say(f"{flights} logs, {missing} of them new or changed")
+        if sys.stderr.isatty() and missing:
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+            columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+            self._task = self._bar.add_task("", total=flights)
+            self._bar.start()
+
+    def done(self, outcome: Outcome) -> None:
+        """A flight is done."""
+        self._done += 1
+        if self._bar is not None:
+            self._bar.update(self._task, advance=1, description=outcome.job.log_uri)
+        elif outcome.ran:
+            facts = outcome.facts
+            why = f" ({facts['reason_code']})" if facts["reason_code"] else ""
+            what = f"{facts['verdict']}{why}, {len(outcome.ran)} stages run"
+            say(f"[{self._done}/{self._total}] {outcome.job.log_uri}: {what}")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+
+def print_night(console: Console, result: Mapping[str, Any], root: Path) -> None:
+    """The closing table: verdicts, what was refused and why, the worst fits, where to look next."""
+    counts = ", ".join(f"{result[verdict]} {verdict}" for verdict in ("ok", "partial", "quarantined", "rejected"))
+    work = f"{result['stages_run']} stages run, {result['stages_cached']} from the cache, {result['seconds']:.1f} s"
+    console.print(f"{len(result['logs'])} logs: {counts}; {work}", markup=False)
+    troubled = [log for log in result["logs"] if log["verdict"] != "ok" or log["reason_code"]]
+    if troubled:
+        lines = [[log["log_uri"], log["verdict"], log["reason"] or ""] for log in troubled]
+        console.print(table(["log", "verdict", "why"], lines, "Logs that need a look"))
+    refused = [(log, refusal) for log in result["logs"] for refusal in log["refusals"] if not is_consequence(refusal)]
+    if refused:
+        lines = [
+            [log["log_uri"], r["stage"], r["status"], r["reason"] or r["reason_code"]] for log, r in refused[:REFUSALS]
+        ]
+        console.print(table(["log", "stage", "status", "why"], lines, "Refusals"))
+        if len(refused) > REFUSALS:
+            console.print(f"  … and {len(refused) - REFUSALS} more: SELECT * FROM refusals", markup=False)
+    worst = _worst(root, [log["flight_id"] for log in result["logs"]])
+    if worst:
+        columns = ["log", "quantity", "method", "against", "TIC", "rms", ""]
+        console.print(table(columns, worst, "Poorest agreement (Theil inequality coefficient, smoothed)"))
+    console.print(f"History: {root}/tables (fieldcal history, fieldcal sql)", markup=False)
+
+
+def print_plan(console: Console, plan: Mapping[str, Any]) -> None:
+    """What a night would do."""
+    console.print(
+        f"{len(plan['logs'])} logs; {plan['stages_to_run']} stages would run. Nothing was changed.", markup=False
+    )
+    lines = [[log["log_uri"], _would(log)] for log in plan["logs"] if log["would_run"] or log["copy_of"]]
+    if lines:
+        console.print(table(["log", "would run"], lines))
+
+
+def _would(log: Mapping[str, Any]) -> str:
+    if log["copy_of"]:
+        return f"nothing: a copy of {log['copy_of']}"
+    return "everything" if log["would_run"][0] == "ingest" else ", ".join(log["would_run"])
+
+
+def _worst(root: Path, flights: Sequence[str]) -> list[list[str]]:
+    import polars as pl
+
+    warehouse = Warehouse(root)
+    places = warehouse.scan("flight").select("flight_id", "log_uri")
+    rows = (
+        warehouse.scan("fit")
+        .filter(pl.col("flight_id").is_in(list(flights)) & (pl.col("signal") == "smoothed"))
+        .join(places, on="flight_id")
+        .sort("tic", "log_uri", "quantity", "method", descending=[True, False, False, False], nulls_last=True)
+        .select("log_uri", "quantity", "method", "reference", "tic", "rms", "rms_unit")
+        .head(WORST)
+        .collect()
+    )
+    return [[cell(value) for value in row] for row in rows.iter_rows()]
