@@ -48,7 +48,8 @@ def triad_rows(
     zero_bias = λ d0 + b at `reference_reading` d0 (3,). Off-diagonal scales (full form) carry no sd.
     """
     matrix, b, d0 = (np.asarray(v, dtype=float) for v in (scale, bias, reference_reading))
-    scale_unit = f"{unit}/{logged_unit}"
+    divisor = f"({logged_unit})" if "/" in logged_unit else logged_unit
+    scale_unit = "1" if unit == logged_unit else f"{unit}/{divisor}"
     rows: list[dict[str, Any]] = []
 
     def add(parameter: str, axis: str, i: int, value: float, variance: float | None, row_unit: str) -> None:
