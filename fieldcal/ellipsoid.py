@@ -207,6 +207,7 @@ def _tls(x: Array) -> Solution:
     """Total least squares: smallest right singular vector of the column-scaled quadric regressors."""
     d = np.column_stack([x * x, 2 * x, np.ones(len(x))])
     norms = np.linalg.norm(d, axis=0)
+    norms[norms == 0.0] = 1.0  # a stuck axis has none
     theta = np.linalg.svd(d / norms, full_matrices=False)[2][-1] / norms
     scale, bias = _quadric_to_triad(np.concatenate([theta[:3], np.zeros(3), theta[3:6]]), float(theta[6]))
     return scale, bias, np.ones(len(x)), 1
