@@ -23,15 +23,16 @@ app = App(
     version=fieldcal.__version__,
     result_action="return_value",
     help_format="plaintext",
+    default_parameter=Parameter(negative=""),
 )
 
 Config = Annotated[Path | None, Parameter(help="fieldcal.toml to use; else the archive's own, if it has one.")]
 Root = Annotated[
     Path | None, Parameter(name="--warehouse", help="Data root; else FIELDCAL_WAREHOUSE, else ./fieldcal-data.")
 ]
-AsJson = Annotated[bool, Parameter(name="--json", negative="", help="One JSON document on stdout.")]
-AsCsv = Annotated[bool, Parameter(name="--csv", negative="", help="CSV on stdout.")]
-DryRun = Annotated[bool, Parameter(negative="", help="List what would run; change nothing.")]
+AsJson = Annotated[bool, Parameter(name="--json", help="One JSON document on stdout.")]
+AsCsv = Annotated[bool, Parameter(name="--csv", help="CSV on stdout.")]
+DryRun = Annotated[bool, Parameter(help="List what would run; change nothing.")]
 Workers = Annotated[int, Parameter(help="Processes that calibrate; results do not depend on it.")]
 
 
@@ -57,7 +58,7 @@ def calibrate(
     vehicle: str | None = None,
     method: Annotated[Literal["serial"], Parameter(show_choices=True)] = "serial",
     profile: Literal["full", "onboard", "paper"] | None = None,
-    set_: Annotated[list[str] | None, Parameter(name="--set", negative="")] = None,
+    set_: Annotated[list[str] | None, Parameter(name="--set")] = None,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -162,7 +163,8 @@ def history(
     from flows.show import print_frame
 
     rows = calibration_history(_root(warehouse), vehicle, sensor, parameter, since)
-    print_frame(rows, as_json=as_json, as_csv=as_csv)
+    whole = as_json or as_csv
+    print_frame(rows if whole else rows.drop("imu_id", "session_id", "flight_id"), as_json=as_json, as_csv=as_csv)
     return OK
 
 
@@ -256,7 +258,7 @@ def _explained(error: Exception) -> int:
 
 
 def _told(sentence: str, code: int) -> int:
-    print(f"fieldcal: {sentence}", file=sys.stderr)
+    print(f"fieldcal: {' '.join(sentence.split())}", file=sys.stderr)
     return code
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from flows.jobs import configuration_of, find_source
-from flows.server import LAST_RECORDS_S, running_server
+from flows.server import running_server
 from warehouse.files import remove_abandoned
 from warehouse.layout import prepare
 
@@ -29,9 +29,9 @@ def run_night(
     with running_server(root) as server:
         from flows.nightly import run_nightly
 
-        server.wait()
         remove_abandoned(root)
         result = run_nightly(
+            server.wait(),
             progress,
             archive=str(archive),
             warehouse=str(root),
@@ -39,7 +39,6 @@ def run_night(
             session=str(session) if session else None,
             workers=workers,
         )
-        time.sleep(LAST_RECORDS_S)
     counts = {name: value for name, value in result.items() if name != "logs"}
     return {**counts, "seconds": round(time.monotonic() - began, 3), "logs": result["logs"]}
 

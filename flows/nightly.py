@@ -19,6 +19,7 @@ import polars as pl
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import StateDetails
+from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.states import Completed
 from prefect.task_runners import ProcessPoolTaskRunner, TaskRunner
 
@@ -113,12 +114,14 @@ def nightly(
     return summary(outcomes, plan.copies, plan.copied, root)
 
 
-def run_nightly(watcher: Watcher | None = None, **parameters: Any) -> dict[str, Any]:
-    """Run the flow in this process; `watcher` hears of every flight as it is done."""
+def run_nightly(api_url: str, watcher: Watcher | None = None, **parameters: Any) -> dict[str, Any]:
+    """Run the flow in this process against the server at `api_url`; `watcher` hears of every flight as it is done."""
     workers = parameters.get("workers", 1)
     runner: TaskRunner[Any] = ProcessPoolTaskRunner(max_workers=workers)
     _watchers[:] = [watcher] if watcher else []
-    result: dict[str, Any] = (nightly if workers == 1 else nightly.with_options(task_runner=runner))(**parameters)
+    night = nightly if workers == 1 else nightly.with_options(task_runner=runner)
+    with temporary_settings({PREFECT_API_URL: api_url}):
+        result: dict[str, Any] = night(**parameters)
     return result
 
 
@@ -162,7 +165,7 @@ def _calibrate(root: Path, plan: Plan, source: Source, workers: int) -> Iterator
         (number, str(root), source, [job.plain() for job in jobs])
         for number, jobs in enumerate(batches(missing, workers) if missing else [])
     ]
-    if workers == 1:
+    if workers == 1 or len(inputs) == 1:
         for batch in inputs:
             yield from _outcomes(run_batch(*batch))
         return

@@ -91,11 +91,8 @@ def print_refusals(console: Console, runs: Rows) -> None:
 
 def is_consequence(run: Mapping[str, Any]) -> bool:
     """Whether a stage stopped only because another gave it nothing."""
-    return (
-        run["status"] == "refused"
-        and str(run["reason_code"]).startswith("no_")
-        and " needs " in str(run["measured"].get("reason") if "measured" in run else run["reason"])
-    )
+    code = str(run["reason_code"])
+    return run["status"] == "refused" and (code.startswith(("no_samples", "no_attitude", "no_manoeuvre")))
 
 
 def fit_table(rows: Rows) -> Any:

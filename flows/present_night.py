@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 from rich.console import Console
 
 from flows.present_flight import is_consequence
-from flows.show import cell, say, table
+from flows.show import number, say, table
 from warehouse import Warehouse
 
 if TYPE_CHECKING:
@@ -74,19 +74,26 @@ def print_night(console: Console, result: Mapping[str, Any], root: Path) -> None
     if troubled:
         lines = [[log["log_uri"], log["verdict"], log["reason"] or ""] for log in troubled]
         console.print(table(["log", "verdict", "why"], lines, "Logs that need a look"))
-    refused = [(log, refusal) for log in result["logs"] for refusal in log["refusals"] if not is_consequence(refusal)]
+    refused = [line for log in result["logs"] for line in _refusals(log)]
     if refused:
-        lines = [
-            [log["log_uri"], r["stage"], r["status"], r["reason"] or r["reason_code"]] for log, r in refused[:REFUSALS]
-        ]
-        console.print(table(["log", "stage", "status", "why"], lines, "Refusals"))
+        console.print(table(["log", "refused", "why"], refused[:REFUSALS], "Refusals"))
         if len(refused) > REFUSALS:
             console.print(f"  … and {len(refused) - REFUSALS} more: SELECT * FROM refusals", markup=False)
     worst = _worst(root, [log["flight_id"] for log in result["logs"]])
     if worst:
-        columns = ["log", "quantity", "method", "against", "TIC", "rms", ""]
+        columns = ["log", "quantity", "method", "against", "TIC", "rms"]
         console.print(table(columns, worst, "Poorest agreement (Theil inequality coefficient, smoothed)"))
     console.print(f"History: {root}/tables (fieldcal history, fieldcal sql)", markup=False)
+
+
+def _refusals(log: Mapping[str, Any]) -> list[list[str]]:
+    """Lines of what a log's stages refused, each reason once; what only follows from another refusal is left out."""
+    stages: dict[str, list[str]] = {}
+    for refusal in log["refusals"]:
+        if not is_consequence(refusal):
+            stages.setdefault(refusal["reason"] or refusal["reason_code"], []).append(refusal["stage"])
+    names = [log["log_uri"], *[""] * len(stages)]
+    return [[name, ", ".join(own), reason] for name, (reason, own) in zip(names, stages.items(), strict=False)]
 
 
 def print_plan(console: Console, plan: Mapping[str, Any]) -> None:
@@ -119,4 +126,4 @@ def _worst(root: Path, flights: Sequence[str]) -> list[list[str]]:
         .head(WORST)
         .collect()
     )
-    return [[cell(value) for value in row] for row in rows.iter_rows()]
+    return [[*row[:4], number(row[4], 3), f"{number(row[5], 3)} {row[6]}"] for row in rows.iter_rows()]

@@ -35,10 +35,11 @@ QUIET = {
     "PREFECT_LOGGING_TO_API_ENABLED": "false",
     "PREFECT_CLI_PROMPT": "false",
     "PREFECT_RESULTS_DEFAULT_SERIALIZER": "json",
-    "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "120",
+    "PREFECT_SERVER_ALLOW_EPHEMERAL_MODE": "false",
 }
 EMBEDDED = {
     "PREFECT_UI_ENABLED": "false",
+    "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
     "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_BATCH_SIZE": "200",
     "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_READ_BATCH_SIZE": "200",
     "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_FLUSH_INTERVAL": "0.5",
@@ -76,7 +77,7 @@ class Server:
         self._own = not self._url
 
     def start(self) -> None:
-        """Begin to start the server, if one is needed."""
+        """Begin to start the server, if one is needed; Prefect, once imported, finds its address in the environment."""
         if not self._own:
             return
         self._home.mkdir(parents=True, exist_ok=True)
@@ -84,6 +85,7 @@ class Server:
         fcntl.flock(self._lock, fcntl.LOCK_EX)
         port = _free_port()
         self._url = f"http://127.0.0.1:{port}/api"
+        os.environ["PREFECT_API_URL"] = self._url
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "flows.server", str(port)],
@@ -98,8 +100,8 @@ class Server:
                 start_new_session=True,
             )
 
-    def wait(self) -> None:
-        """Wait until the server answers, and make it the one that Prefect uses.
+    def wait(self) -> str:
+        """Wait until the server answers; its address.
 
         Raises
         ------
@@ -113,8 +115,8 @@ class Server:
             if time.monotonic() > give_up:
                 raise FieldcalError("prefect_unavailable", self._silence())
             time.sleep(0.05)
-        os.environ["PREFECT_API_URL"] = str(self._url)
         self._release()
+        return str(self._url)
 
     def stop(self) -> None:
         """Stop the server, if it is ours, after it had time to write its last records."""
@@ -124,6 +126,7 @@ class Server:
         os.environ.pop("PREFECT_API_URL", None)
         process, self._process = self._process, None
         if process.poll() is None:
+            time.sleep(LAST_RECORDS_S)
             process.terminate()
             try:
                 process.wait(timeout=5)

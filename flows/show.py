@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 PLAIN_WIDTH = 160
+FRAME_WIDTH = 1000
 NESTED = ("measured", "versions", "findings")
 
 
@@ -43,7 +44,7 @@ def print_frame(frame: pl.DataFrame, *, as_json: bool, as_csv: bool) -> None:
         print_csv(frame)
     else:
         shown = table(frame.columns, ([cell(value) for value in row] for row in frame.iter_rows()))
-        console().print(shown)
+        console(plain_width=FRAME_WIDTH).print(shown)
         say(f"{frame.height} row{'' if frame.height == 1 else 's'}")
 
 
@@ -57,12 +58,11 @@ def unfolded(row: Mapping[str, Any]) -> dict[str, Any]:
     return {k: json.loads(v) if k in NESTED and isinstance(v, str) else v for k, v in row.items()}
 
 
-def console(*, stderr: bool = False) -> Console:
-    """A console; wide and without colour when it is no terminal."""
+def console(*, plain_width: int = PLAIN_WIDTH) -> Console:
+    """The console of stdout; `plain_width` wide when it is no terminal."""
     from rich.console import Console
 
-    stream = sys.stderr if stderr else sys.stdout
-    return Console(file=stream, width=None if stream.isatty() else PLAIN_WIDTH, highlight=False, soft_wrap=False)
+    return Console(file=sys.stdout, width=None if sys.stdout.isatty() else plain_width, highlight=False)
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None) -> Table:

@@ -1,0 +1,22 @@
+"""One Prefect server for all tests that run flows."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from flows.server import Server, prepare_environment
+
+
+@pytest.fixture(scope="session")
+def prefect_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of a server that is running, which fieldcal takes from the environment; started at the first use."""
+    former = os.environ.pop("PREFECT_API_URL", None)
+    prepare_environment(tmp_path_factory.mktemp("prefect"))
+    with Server(tmp_path_factory.getbasetemp()) as server:
+        url = server.wait()
+        yield url
+    if former is not None:
+        os.environ["PREFECT_API_URL"] = former
