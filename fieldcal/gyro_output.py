@@ -74,6 +74,40 @@ def without_stretch_means(x: Array, first: np.ndarray, weight: Array) -> Array:
     return np.asarray((flat - np.repeat(means, np.diff(np.r_[starts, len(x)]), axis=0)).reshape(x.shape))
 
 
+def random_walk(t: Array, residual: Array, stretch: np.ndarray, weight: Array) -> tuple[Array, float]:
+    """Random walk in the attitude error, rad²/s by component (3,), and the share of the residual's variance it makes.
+
+    From the growth of mean square differences between lags of a quarter and a half stretch: what is stationary in the
+    residual (the attitude's own error) has levelled off by then and drops out."""
+    interval = float(np.median(np.diff(t)))
+    lengths = np.bincount(stretch)
+    longest = float(np.median(lengths[lengths > 0])) * interval
+    short, long = max(1, round(0.25 * longest / interval)), max(2, round(0.5 * longest / interval))
+    growth = []
+    for lag in (short, long):
+        same = stretch[lag:] == stretch[:-lag]
+        w = (weight[lag:] * weight[:-lag])[same]
+        difference = (residual[lag:] - residual[:-lag])[same]
+        growth.append(w @ difference**2 / max(float(w.sum()), 1e-300))
+    walk = np.maximum((growth[1] - growth[0]) / ((long - short) * interval), 0.0)
+    variance = float(np.average(np.sum(residual**2, axis=1), weights=weight))
+    return walk, float(np.clip(walk.sum() * longest / 6.0 / max(variance, 1e-300), 0.0, 1.0))
+
+
+def walk_information(weighted: Array, dt: Array, first: np.ndarray, walk: Array) -> Array:
+    """Σ_k q Δt C_kᵀC_k, (6, 6): what a random walk q (3,) of the attitude does to the score Σ Sᵀw r.
+
+    An increment at sample k moves every later sample of its stretch, so C_k is the sum of the weighted sensitivities
+    (n, 3, 6) from k to the stretch's end."""
+    total = np.cumsum(weighted, axis=0)
+    starts = np.flatnonzero(first)
+    ends = np.r_[starts[1:], len(weighted)] - 1
+    later = np.repeat(total[ends], np.diff(np.r_[starts, len(weighted)]), axis=0)
+    later[1:] -= total[:-1]
+    step = np.r_[0.0, dt]
+    return np.asarray(np.einsum("k,c,kcp,kcq->pq", step, walk, later, later, optimize=True))
+
+
 def suitable_stretch_s(rate_noise: float, interval_s: float, attitude_sd: float) -> float:
     """How long one may integrate before gyroscope noise outgrows the attitude's own error, s, within 5 to 200 s.
 
@@ -177,7 +211,13 @@ def fit_output_error(
         # itself.
         claimed = np.sqrt(np.diagonal(np.linalg.pinv(normal, hermitian=True)) * float(y @ y) / (3 * n))
         if (np.abs(step) < np.maximum(0.02 * claimed, 1e-8 * float(np.max(np.abs(theta))))).all():
-            white, coloured = least_squares_covariance(sensitivity * root[:, None, None], centred * root[:, None])
+            white, covariance = least_squares_covariance(sensitivity * root[:, None, None], centred * root[:, None])
+            covariance *= inflation
+            if not fixed:
+                walk, share = random_walk(t, residual, stretch, weight)
+                information = walk_information(sensitivity * weight[:, None, None], dt, first, walk)
+                inverse = np.linalg.pinv(normal, hermitian=True)
+                covariance = (1.0 - share) * covariance + inverse @ information @ inverse
             transform = np.zeros((6, 6))
             transform[:3, :3] = np.diag(1.0 / x_scale)
             transform[3:, 3:] = np.eye(3)
@@ -186,7 +226,7 @@ def fit_output_error(
             return GyroFit(
                 scale=constants[:3],
                 bias=constants[3:],
-                covariance=inflation * transform @ coloured @ transform.T,
+                covariance=transform @ covariance @ transform.T,
                 covariance_white=transform @ white @ transform.T,
                 residual_rms=float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
                 n_samples=n,

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 from fieldcal.rotation import Array
 from fieldcal.statistics import MAD_TO_SIGMA
 
-
 REST_SHARE = 0.02  # of the sustained level: slower is rest
 
 
