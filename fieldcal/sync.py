@@ -153,7 +153,7 @@ def correlate(
     sum_a, sum_b = cross(a, mb), cross(ma, b)
     variance = (cross(a * a, mb) - sum_a**2 / overlap) * (cross(ma, b * b) - sum_b**2 / overlap)
     enough = overlap > min(min_overlap_s / imu.interval_s, 0.5 * min(ma.sum(), mb.sum()))
-    floor = 1e-6 * float(np.sum(a * a)) * float(np.sum(b * b))
+    floor = max(1e-6 * float(np.sum(a * a)) * float(np.sum(b * b)), 1e-300)
     r = np.where(
         enough & (variance > floor), (cross(a, b) - sum_a * sum_b / overlap) / np.sqrt(np.maximum(variance, floor)), 0.0
     )
