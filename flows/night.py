@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from flows.jobs import configuration_of, find_source
 from flows.server import running_server
 from warehouse.files import remove_abandoned
 from warehouse.layout import prepare
 
-
-class Progress(Protocol):
-    """Hears of the night's progress."""
-
-    def planned(self, flights: int, missing: int) -> None: ...
-    def done(self, outcome: Any) -> None: ...
+if TYPE_CHECKING:
+    from flows.watching import Watcher
 
 
 def run_night(
-    archive: Path, root: Path, config: Path | None, session: Path | None, workers: int, progress: Progress | None = None
+    archive: Path, root: Path, config: Path | None, session: Path | None, workers: int, progress: Watcher | None = None
 ) -> dict[str, Any]:
     """Run the flow `nightly`; its JSON, `seconds` included."""
     began = time.monotonic()

@@ -13,7 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import polars as pl
 from prefect import flow, task
@@ -29,20 +29,15 @@ from flows.history import publish_vehicle, withdraw
 from flows.jobs import Job, Source, configuration_of, find_source
 from flows.outcome import Outcome, summary
 from flows.plan import Plan, make_plan
+from flows.show import say
 from flows.steps import FlightWork, Record
+from flows.watching import Watcher, tell_done, tell_plan, watch
 from warehouse import Warehouse
 from warehouse.errors import WarehouseError
 
 LARGEST_BATCH = 40
 BATCHES_PER_WORKER = 4
 Batch = tuple[int, str, Source, list[dict[str, Any]]]
-
-
-class Watcher(Protocol):
-    """Hears of the night's progress, in the process of the flow."""
-
-    def planned(self, flights: int, missing: int) -> None: ...
-    def done(self, outcome: Outcome) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -58,7 +53,6 @@ class Publishing:
 # Prefect walks through the parameters of a task: large things are handed over here, by name, within this process.
 _at_work: dict[str, FlightWork] = {}
 _to_publish: dict[str, Publishing] = {}
-_watchers: list[Watcher] = []
 
 
 @task(name="step", task_run_name="{step} {log_uri}", cache_policy=NO_CACHE, persist_result=False)
@@ -76,7 +70,7 @@ def run_step(flight_id: str, step: str, log_uri: str) -> Any:
 @task(name="batch", task_run_name="batch {number}", cache_policy=NO_CACHE, persist_result=False)
 def run_batch(number: int, root: str, source: Source, jobs: list[dict[str, Any]]) -> dict[str, Any]:
     """A batch of flights, every step a task (`flows.flights.flights`)."""
-    return flights(root, source, jobs, _as_task, _tell)
+    return flights(root, source, jobs, _as_task, tell_done)
 
 
 @task(name="publish", task_run_name="publish {vehicle_id}", cache_policy=NO_CACHE, persist_result=False)
@@ -107,8 +101,7 @@ def nightly(
     source = find_source(Path(config) if config else None, place)
     settings = configuration_of(source)
     plan = make_plan(root, place, settings, Path(session) if session else None)
-    for watcher in _watchers:
-        watcher.planned(len(plan.jobs), len(plan.missing))
+    tell_plan(len(plan.jobs), len(plan.missing))
     outcomes = [*_from_cache(plan), *_calibrate(root, plan, source, workers)]
     _publish(root, settings, outcomes)
     return summary(outcomes, plan.copies, plan.copied, root)
@@ -118,7 +111,7 @@ def run_nightly(api_url: str, watcher: Watcher | None = None, **parameters: Any)
     """Run the flow in this process against the server at `api_url`; `watcher` hears of every flight as it is done."""
     workers = parameters.get("workers", 1)
     runner: TaskRunner[Any] = ProcessPoolTaskRunner(max_workers=workers)
-    _watchers[:] = [watcher] if watcher else []
+    watch(watcher)
     night = nightly if workers == 1 else nightly.with_options(task_runner=runner)
     with temporary_settings({PREFECT_API_URL: api_url}):
         result: dict[str, Any] = night(**parameters)
@@ -144,17 +137,12 @@ def _as_task(work: FlightWork, step: str) -> tuple[Record, bool]:
         del _at_work[work.job.flight_id]
 
 
-def _tell(outcome: Outcome) -> None:
-    for watcher in _watchers:
-        watcher.done(outcome)
-
-
 def _from_cache(plan: Plan) -> Iterator[Outcome]:
     for job in plan.jobs:
         if job.flight_id in plan.unchanged:
             records = plan.unchanged[job.flight_id]
             outcome = Outcome(job, records, cached=tuple(records))
-            _tell(outcome)
+            tell_done(outcome)
             yield outcome
 
 
@@ -173,10 +161,11 @@ def _calibrate(root: Path, plan: Plan, source: Source, workers: int) -> Iterator
     for batch, future in zip(inputs, futures, strict=True):
         try:
             answer = future.result()
-        except Exception:
+        except Exception as error:
+            say(f"Batch {batch[0]} was lost ({type(error).__name__}: {error}); its logs follow one by one.")
             answer = _one_by_one(batch)
         for outcome in _outcomes(answer):
-            _tell(outcome)
+            tell_done(outcome)
             yield outcome
 
 

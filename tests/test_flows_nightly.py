@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from fieldcal.pipeline import PIPELINE
 from fieldcal.simulate import Experiment
 from fieldcal.simulate_logs import write_flights
 from flows.night import dry_run, run_night
+from flows.outcome import Outcome
 from flows.steps import STEPS
 from warehouse import Warehouse
 from warehouse.content import content_sha256
@@ -212,8 +214,27 @@ def test_a_log_that_moves_or_grows_leaves_no_ghost(archive: Path, warehouse: Pat
     ]
 
 
-def test_two_processes_give_the_same_content(simulated: Path, first_night: tuple[Path, Any], tmp_path: Path) -> None:
-    result = run_night(simulated, tmp_path / "two", None, None, 2)
+class Bar:
+    """A watcher that cannot be pickled, as a progress bar cannot."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.told: list[tuple[str, int]] = []
+
+    def planned(self, flights: int, missing: int) -> None:
+        self.told.append(("planned", missing))
+
+    def done(self, outcome: Outcome) -> None:
+        self.told.append((outcome.job.vehicle_id, len(outcome.ran)))
+
+
+def test_two_processes_give_the_same_content(
+    simulated: Path, first_night: tuple[Path, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bar = Bar()
+    result = run_night(simulated, tmp_path / "two", None, None, 2, bar)
+    assert bar.told == [("planned", 2), ("sim-1", len(STEPS)), ("sim-2", len(STEPS))]
+    assert "lost" not in capsys.readouterr().err
     assert (result["ok"], result["stages_run"]) == (2, 2 * len(STEPS))
     assert content_sha256(tmp_path / "two") == content_sha256(first_night[0])
     assert file_hashes(tmp_path / "two" / "tables") == file_hashes(first_night[0] / "tables")
