@@ -108,6 +108,7 @@ def with_sd(value: float | None, sd: float | None) -> str:
     from math import floor, log10
 
     places = 1 - floor(log10(sd))
+    places = 0 if -3 <= places < 0 else places
     if 0 <= places <= 9:
         return f"{value:.{places}f} ± {sd:.{places}f}"
     return f"{number(value)} ± {number(sd, 2)}"
