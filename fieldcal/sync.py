@@ -29,6 +29,8 @@ from fieldcal.smoothing import differentiate, low_pass
 from fieldcal.statistics import huber_weights, least_squares_covariance, robust_sigma
 
 FINE_CUTOFF_HZ = 8.0
+# Chance peaks of unrelated motions reach 0.9 in the coarse correlation; the vector fit tells them.
+MIN_EXPLAINED, MAX_SKEW_PPM, MAX_LAG_SD_S = 0.6, 2000.0, 0.01
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,8 @@ class SyncFit:
     """VPS clock + lag = IMU clock. `lag_s` at the first IMU sample, `lag_mid_s` at mid-record, `skew_ppm` > 0: VPS
     clock fast.
 
-    `peak` and `runner_up` are correlations (the second: best one outside the peak); `matrix` (3, 3) maps VPS body
-    rates to logged rates."""
+    `explained` is the share of the rates' variance that the VPS accounts for; `peak` and `runner_up` are
+    correlations (the second: best one outside the peak); `matrix` (3, 3) maps VPS body rates to logged rates."""
 
     lag_s: float
     lag_mid_s: float
@@ -63,6 +65,7 @@ class SyncFit:
     peak: float
     runner_up: float
     peak_width_s: float
+    explained: float
     matrix: Array
     reference_s: float
 
@@ -121,7 +124,6 @@ def vps_rates(t: ArrayLike, q: ArrayLike, interval_s: float, *, max_gap_s: float
     # The derivative at a place uses its neighbours: grow the gaps by the window.
     spoiled = np.convolve(~valid, np.ones(9), mode="same") > 0
     rate = body_rate(on_grid, differentiate(on_grid, interval_s))
-    rate[spoiled] = 0.0
     return UniformRates(float(t[0]), interval_s, rate, ~spoiled)
 
 
@@ -200,8 +202,8 @@ def synchronise(
     Raises
     ------
     UnusableFlight
-        `vps_too_short`, `flat_peak` (peak below `min_peak`), `ambiguous_peak` (runner-up within 2 % of the peak);
-        `measured` has the numbers.
+        `vps_too_short`, `flat_peak` (peak below `min_peak`), `ambiguous_peak` (runner-up within 2 % of the peak),
+        `not_the_same_motion` (the vector fit fails at the best lag); `measured` has the numbers.
 
     Notes
     -----
@@ -215,9 +217,7 @@ def synchronise(
     interval = float(max(np.median(np.diff(t_imu)), 1e-3))
     imu = imu_rates(t_imu, rate_imu, interval)
     vps = vps_rates(t_vps, q_vps, interval, max_gap_s=max_gap_s)
-    imu, vps = (
-        UniformRates(s.start_s, interval, low_pass(s.rate, FINE_CUTOFF_HZ, interval), s.valid) for s in (imu, vps)
-    )
+    imu, vps = (_smoothed(s) for s in (imu, vps))
     lag, peak, runner_up, width = correlate(imu, vps, max_lag_s)
     measured = {"peak": peak, "runner_up": runner_up, "peak_width_s": width, "coarse_lag_s": lag}
     if peak < min_peak:
@@ -232,7 +232,26 @@ def synchronise(
             f"Two lags fit about equally well (correlations {peak:.3f} and {runner_up:.3f}): add an unrepeated motion.",
             measured,
         )
-    return _refine(imu, vps, lag, float(t_imu[0]), 0.5 * float(t_imu[0] + t_imu[-1]), measured)
+    fit = _refine(imu, vps, lag, float(t_imu[0]), 0.5 * float(t_imu[0] + t_imu[-1]), measured)
+    measured |= {"explained": fit.explained, "skew_ppm": fit.skew_ppm, "lag_sd_s": fit.lag_sd_s}
+    if fit.explained < MIN_EXPLAINED or abs(fit.skew_ppm) > MAX_SKEW_PPM or fit.lag_sd_s > MAX_LAG_SD_S:
+        raise UnusableFlight(
+            "not_the_same_motion",
+            f"At the best lag the VPS explains {100 * fit.explained:.0f} % of the gyroscope's variance, with a clock"
+            f" drift of {fit.skew_ppm:.0f} ppm and a lag known to {1e3 * fit.lag_sd_s:.2g} ms: not the same motion.",
+            measured,
+        )
+    return fit
+
+
+def _smoothed(s: UniformRates) -> UniformRates:
+    """Low-passed rates; what the filter's main lobe mixes with a gap or an end is masked too."""
+    rate = low_pass(s.rate, FINE_CUTOFF_HZ, s.interval_s)
+    reach = round(0.5 / FINE_CUTOFF_HZ / s.interval_s)
+    bad = np.pad(~s.valid, reach, constant_values=True)
+    total = np.concatenate([[0], np.cumsum(bad)])
+    near = total[2 * reach + 1 :] - total[: len(s.valid)] > 0
+    return UniformRates(s.start_s, s.interval_s, rate, ~near)
 
 
 def _refine(
@@ -273,6 +292,8 @@ def _refine(
         lag, skew = lag + float(step[0]), skew + float(step[1])
         if abs(step[0]) < 1e-9 and abs(step[1]) < 1e-10:
             break
+    spread = imu.rate[inside] - np.average(imu.rate[inside], axis=0, weights=weight)
+    explained = 1.0 - float(weight @ np.sum(residual**2, axis=1)) / float(weight @ np.sum(spread**2, axis=1))
     # Both sides are filtered: the residual's colour sets the sd.
     _, covariance = least_squares_covariance(sensitivity, residual * root[:, None])
     at_first = np.array([1.0, middle - first])  # lag(t) = lag_mid − skew (t − middle)
@@ -282,6 +303,7 @@ def _refine(
         lag_sd_s=float(np.sqrt(at_first @ covariance @ at_first)),
         skew_ppm=1e6 * skew,
         skew_sd_ppm=float(1e6 * np.sqrt(covariance[1, 1])),
+        explained=explained,
         peak=measured["peak"],
         runner_up=measured["runner_up"],
         peak_width_s=measured["peak_width_s"],

@@ -106,7 +106,10 @@ ACCELERATION_EXCESS_MPS2 = Column(
     "length of the calibrated accelerometer vector less gravity: motion that spoils the vertical",
 )
 FIELD_EXCESS = Column(
-    "field_excess", _F64, "1", "length of the calibrated magnetometer vector over the local field, less one: other magnets"
+    "field_excess",
+    _F64,
+    "1",
+    "length of the calibrated magnetometer vector over the local field, less 1: other magnets",
 )
 ATTITUDE_WEIGHT = Column("weight", _F64, "1", "relative trust in the attitude, 0 to 1, from both excesses")
 BODY_RATE = tuple(
