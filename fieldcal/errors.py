@@ -29,6 +29,10 @@ class FieldcalError(Exception):
         self.sentence = sentence
         self.measured: dict[str, Any] = dict(measured or {})
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies whole, also between processes."""
+        return type(self), (self.reason_code, self.sentence, self.measured)
+
 
 class ConfigurationError(FieldcalError):
     """The configuration is wrong: nothing runs until it is mended."""
