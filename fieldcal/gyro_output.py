@@ -74,28 +74,35 @@ def without_stretch_means(x: Array, first: np.ndarray, weight: Array) -> Array:
     return np.asarray((flat - np.repeat(means, np.diff(np.r_[starts, len(x)]), axis=0)).reshape(x.shape))
 
 
-def random_walk(t: Array, residual: Array, stretch: np.ndarray, weight: Array) -> tuple[Array, float]:
-    """Random walk in the attitude error, rad²/s by component (3,), and the share of the residual's variance it makes.
+def random_walk(t: Array, residual: Array, stretch: np.ndarray, weight: Array) -> tuple[float, float]:
+    """Random walk in the attitude error, rad²/s a component, and the share of the residual's variance that it makes.
 
-    From the growth of mean square differences between lags of a quarter and a half stretch: what is stationary in the
-    residual (the attitude's own error) has levelled off by then and drops out."""
+    From the growth of mean square differences between lags of an eighth and a half of a stretch: what is stationary
+    in the residual (the attitude's own error) has levelled off by then and drops out. Growth that blocks of the
+    record do not agree on (mean below its standard error) is chance: 0."""
     interval = float(np.median(np.diff(t)))
     lengths = np.bincount(stretch)
-    longest = float(np.median(lengths[lengths > 0])) * interval
-    short, long = max(1, round(0.25 * longest / interval)), max(2, round(0.5 * longest / interval))
-    growth = []
-    for lag in (short, long):
-        same = stretch[lag:] == stretch[:-lag]
-        w = (weight[lag:] * weight[:-lag])[same]
-        difference = (residual[lag:] - residual[:-lag])[same]
-        growth.append(w @ difference**2 / max(float(w.sum()), 1e-300))
-    walk = np.maximum((growth[1] - growth[0]) / ((long - short) * interval), 0.0)
-    variance = float(np.average(np.sum(residual**2, axis=1), weights=weight))
-    return walk, float(np.clip(walk.sum() * longest / 6.0 / max(variance, 1e-300), 0.0, 1.0))
+    length = float(np.median(lengths[lengths > 0])) * interval
+    short, long = max(1, round(length / 8.0 / interval)), max(2, round(length / 2.0 / interval))
+    i = np.arange(max(len(residual) - long, 0))
+    i = i[stretch[i] == stretch[i + long]]
+    if not len(i):
+        return 0.0, 0.0
+    growth = np.mean((residual[i + long] - residual[i]) ** 2 - (residual[i + short] - residual[i]) ** 2, axis=1)
+    trust = weight[i] * weight[i + long]
+    block = i // long
+    total, share = np.bincount(block, trust * growth), np.bincount(block, trust)
+    blocks = total[share > 0] / share[share > 0]
+    mean = float(np.average(growth, weights=trust))
+    if len(blocks) < 3 or mean < float(np.std(blocks, ddof=1)) / np.sqrt(len(blocks)):
+        return 0.0, 0.0
+    walk = mean / ((long - short) * interval)
+    variance = float(np.average(np.mean(residual**2, axis=1), weights=weight))
+    return walk, float(np.clip(walk * length / 6.0 / max(variance, 1e-300), 0.0, 1.0))
 
 
-def walk_information(weighted: Array, dt: Array, first: np.ndarray, walk: Array) -> Array:
-    """Σ_k q Δt C_kᵀC_k, (6, 6): what a random walk q (3,) of the attitude does to the score Σ Sᵀw r.
+def walk_information(weighted: Array, dt: Array, first: np.ndarray, walk: float) -> Array:
+    """Σ_k q Δt C_kᵀC_k, (6, 6): what a random walk q of the attitude does to the score Σ Sᵀw r.
 
     An increment at sample k moves every later sample of its stretch, so C_k is the sum of the weighted sensitivities
     (n, 3, 6) from k to the stretch's end."""
@@ -104,8 +111,9 @@ def walk_information(weighted: Array, dt: Array, first: np.ndarray, walk: Array)
     ends = np.r_[starts[1:], len(weighted)] - 1
     later = np.repeat(total[ends], np.diff(np.r_[starts, len(weighted)]), axis=0)
     later[1:] -= total[:-1]
-    step = np.r_[0.0, dt]
-    return np.asarray(np.einsum("k,c,kcp,kcq->pq", step, walk, later, later, optimize=True))
+    later *= np.sqrt(walk * np.r_[0.0, dt])[:, None, None]
+    flat = later.reshape(-1, 6)
+    return np.asarray(flat.T @ flat)
 
 
 def suitable_stretch_s(rate_noise: float, interval_s: float, attitude_sd: float) -> float:
@@ -211,13 +219,18 @@ def fit_output_error(
         # itself.
         claimed = np.sqrt(np.diagonal(np.linalg.pinv(normal, hermitian=True)) * float(y @ y) / (3 * n))
         if (np.abs(step) < np.maximum(0.02 * claimed, 1e-8 * float(np.max(np.abs(theta))))).all():
-            white, covariance = least_squares_covariance(sensitivity * root[:, None, None], centred * root[:, None])
+            white, covariance = least_squares_covariance(
+                sensitivity * root[:, None, None],
+                centred * root[:, None],
+                nuisance=0 if fixed else 3 * int(first.sum()),
+            )
             covariance *= inflation
             if not fixed:
                 walk, share = random_walk(t, residual, stretch, weight)
-                information = walk_information(sensitivity * weight[:, None, None], dt, first, walk)
-                inverse = np.linalg.pinv(normal, hermitian=True)
-                covariance = (1.0 - share) * covariance + inverse @ information @ inverse
+                if walk > 0.0:
+                    information = walk_information(sensitivity * weight[:, None, None], dt, first, walk)
+                    inverse = np.linalg.pinv(normal, hermitian=True)
+                    covariance = (1.0 - share) * covariance + inverse @ information @ inverse
             transform = np.zeros((6, 6))
             transform[:3, :3] = np.diag(1.0 / x_scale)
             transform[3:, 3:] = np.eye(3)

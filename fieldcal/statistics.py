@@ -82,10 +82,11 @@ def coloured_information(sensitivity: ArrayLike, residual: ArrayLike) -> Array:
     return middle
 
 
-def least_squares_covariance(sensitivity: ArrayLike, residual: ArrayLike) -> tuple[Array, Array]:
+def least_squares_covariance(sensitivity: ArrayLike, residual: ArrayLike, *, nuisance: int = 0) -> tuple[Array, Array]:
     """Covariances of a least-squares fit: (Cramér–Rao σ²M⁻¹, coloured M⁻¹[ΣΣ Sᵀ𝓡S]M⁻¹), each (p, p).
 
-    `sensitivity` (n, c, p) and `residual` (n, c) as in `coloured_information`. Publish the second.
+    `sensitivity` (n, c, p) and `residual` (n, c) as in `coloured_information`; `nuisance` counts parameters that were
+    eliminated beforehand. Publish the second.
     """
     s, r = np.asarray(sensitivity, dtype=float), np.asarray(residual, dtype=float)
     n, channels, p = s.shape
@@ -94,4 +95,19 @@ def least_squares_covariance(sensitivity: ArrayLike, residual: ArrayLike) -> tup
     scale[scale == 0.0] = 1.0
     inverse = np.linalg.pinv((flat / scale).T @ (flat / scale), hermitian=True) / np.outer(scale, scale)
     sigma_squared = float(np.sum(r * r)) / max(1, n * channels - p)
-    return sigma_squared * inverse, inverse @ coloured_information(s, r) @ inverse
+    middle = coloured_information(s, r) * _freedom(r, (p + nuisance) / channels)
+    return sigma_squared * inverse, inverse @ middle @ inverse
+
+
+def _freedom(residual: Array, parameters: float) -> float:
+    """n_e/(n_e − p): what p fitted parameters a channel took from the residual's variance when only n_e of its samples
+    are independent; at most 4. n_e is n over the sum of the autocorrelation, tapered as in `coloured_information`."""
+    n = len(residual)
+    size = fft.next_fast_len(2 * n, real=True)
+    correlation = fft.irfft(np.sum(np.abs(fft.rfft(residual, size, axis=0)) ** 2, axis=1), size)
+    if not correlation[0] > 0.0:
+        return 1.0
+    lags = max(1, n // 10)
+    taper = 1.0 - np.arange(1, lags + 1) / (lags + 1)
+    independent = n / max(1.0, 1.0 + 2.0 * float(taper @ correlation[1 : lags + 1]) / float(correlation[0]))
+    return min(independent / max(independent - parameters, 1e-9), 4.0)
