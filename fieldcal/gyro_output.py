@@ -27,6 +27,8 @@ from fieldcal.rotation import (
 )
 from fieldcal.statistics import huber_inflation, huber_weights, least_squares_covariance, robust_sigma
 
+BLOCKS = 12  # of a stretch, to tell a random walk from stationary error
+
 
 def shooting_segments(t: ArrayLike, segment: ArrayLike, longest_s: float) -> np.ndarray:
     """Number the stretches to integrate: contiguous `segment`s (n,) cut into equal parts of at most `longest_s`."""
@@ -77,28 +79,30 @@ def without_stretch_means(x: Array, first: np.ndarray, weight: Array) -> Array:
 def random_walk(t: Array, residual: Array, stretch: np.ndarray, weight: Array) -> tuple[float, float]:
     """Random walk in the attitude error, rad²/s a component, and the share of the residual's variance that it makes.
 
-    From the growth of mean square differences between lags of an eighth and a half of a stretch: what is stationary
-    in the residual (the attitude's own error) has levelled off by then and drops out. Growth that blocks of the
-    record do not agree on (mean below its standard error) is chance: 0."""
+    From means over twelfths of a stretch: how much further apart they are half a stretch away than next to each other.
+    What is stationary in the residual (the attitude's own error) averages out in the means and is as far apart at both
+    distances."""
+    starts = np.flatnonzero(np.r_[True, stretch[1:] != stretch[:-1]])
+    lengths = np.diff(np.r_[starts, len(stretch)])
+    typical, apart = float(np.median(lengths)), BLOCKS // 2
+    size = max(1, int(typical) // BLOCKS)
     interval = float(np.median(np.diff(t)))
-    lengths = np.bincount(stretch)
-    length = float(np.median(lengths[lengths > 0])) * interval
-    short, long = max(1, round(length / 8.0 / interval)), max(2, round(length / 2.0 / interval))
-    i = np.arange(max(len(residual) - long, 0))
-    i = i[stretch[i] == stretch[i + long]]
-    if not len(i):
+    near, far = [], []
+    for start, length in zip(starts.tolist(), lengths.tolist(), strict=True):
+        count = length // size
+        if count <= apart:
+            continue
+        own = slice(start, start + count * size)
+        w = weight[own].reshape(count, size, 1)
+        mean = np.sum(residual[own].reshape(count, size, 3) * w, axis=1) / np.maximum(w.sum(axis=1), 1e-300)
+        near.append((mean[1:] - mean[:-1]) ** 2)
+        far.append((mean[apart:] - mean[:-apart]) ** 2)
+    if not near:
         return 0.0, 0.0
-    growth = np.mean((residual[i + long] - residual[i]) ** 2 - (residual[i + short] - residual[i]) ** 2, axis=1)
-    trust = weight[i] * weight[i + long]
-    block = i // long
-    total, share = np.bincount(block, trust * growth), np.bincount(block, trust)
-    blocks = total[share > 0] / share[share > 0]
-    mean = float(np.average(growth, weights=trust))
-    if len(blocks) < 3 or mean < float(np.std(blocks, ddof=1)) / np.sqrt(len(blocks)):
-        return 0.0, 0.0
-    walk = mean / ((long - short) * interval)
+    growth = float(np.mean(np.concatenate(far)) - np.mean(np.concatenate(near)))
+    walk = max(growth / ((apart - 1) * size * interval), 0.0)
     variance = float(np.average(np.mean(residual**2, axis=1), weights=weight))
-    return walk, float(np.clip(walk * length / 6.0 / max(variance, 1e-300), 0.0, 1.0))
+    return walk, float(np.clip(walk * typical * interval / 6.0 / max(variance, 1e-300), 0.0, 1.0))
 
 
 def walk_information(weighted: Array, dt: Array, first: np.ndarray, walk: float) -> Array:
