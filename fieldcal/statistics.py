@@ -60,11 +60,16 @@ def coloured_information(sensitivity: ArrayLike, residual: ArrayLike) -> Array:
     -------
     (p, p) array
     """
-    s, r = np.asarray(sensitivity, dtype=float), np.asarray(residual, dtype=float)
+    return _coloured(np.asarray(sensitivity, dtype=float), np.asarray(residual, dtype=float))[0]
+
+
+def _coloured(s: Array, r: Array) -> tuple[Array, float]:
+    """`coloured_information`, and how many of the n samples are independent: n over the sum of the tapered
+    autocorrelation, channels pooled."""
     n = len(r)
-    size = fft.next_fast_len(2 * n, real=True)
-    correlation = fft.irfft(np.abs(fft.rfft(r, size, axis=0)) ** 2, size, axis=0) / n
     lags = max(1, n // 10)
+    size = fft.next_fast_len(n + lags + 1, real=True)  # no wrap-around within the lags that the taper keeps
+    correlation = fft.irfft(np.abs(fft.rfft(r, size, axis=0)) ** 2, size, axis=0) / n
     taper = np.zeros(size)
     taper[: lags + 1] = 1.0 - np.arange(lags + 1) / (lags + 1)
     taper[-lags:] = taper[lags:0:-1]
@@ -79,7 +84,9 @@ def coloured_information(sensitivity: ArrayLike, residual: ArrayLike) -> Array:
         transform = fft.rfft(s[:, channel, :], size, axis=0)
         weighted = transform * (spectrum[:, channel] * twice / size)[:, None]
         middle += (transform.conj().T @ weighted).real
-    return middle
+    variance = float(correlation[0].sum())
+    independent = n / max(1.0, float(spectrum[0].sum()) / variance) if variance > 0.0 else float(n)
+    return middle, independent
 
 
 def least_squares_covariance(sensitivity: ArrayLike, residual: ArrayLike, *, nuisance: int = 0) -> tuple[Array, Array]:
@@ -95,19 +102,7 @@ def least_squares_covariance(sensitivity: ArrayLike, residual: ArrayLike, *, nui
     scale[scale == 0.0] = 1.0
     inverse = np.linalg.pinv((flat / scale).T @ (flat / scale), hermitian=True) / np.outer(scale, scale)
     sigma_squared = float(np.sum(r * r)) / max(1, n * channels - p)
-    middle = coloured_information(s, r) * _freedom(r, (p + nuisance) / channels)
-    return sigma_squared * inverse, inverse @ middle @ inverse
-
-
-def _freedom(residual: Array, parameters: float) -> float:
-    """n_e/(n_e − p): what p fitted parameters a channel took from the residual's variance when only n_e of its samples
-    are independent; at most 4. n_e is n over the sum of the autocorrelation, tapered as in `coloured_information`."""
-    n = len(residual)
-    size = fft.next_fast_len(2 * n, real=True)
-    correlation = fft.irfft(np.sum(np.abs(fft.rfft(residual, size, axis=0)) ** 2, axis=1), size)
-    if not correlation[0] > 0.0:
-        return 1.0
-    lags = max(1, n // 10)
-    taper = 1.0 - np.arange(1, lags + 1) / (lags + 1)
-    independent = n / max(1.0, 1.0 + 2.0 * float(taper @ correlation[1 : lags + 1]) / float(correlation[0]))
-    return min(independent / max(independent - parameters, 1e-9), 4.0)
+    # p parameters a channel took from the variance of n_e independent samples: n_e/(n_e − p), at most 4.
+    middle, independent = _coloured(s, r)
+    freedom = min(independent / max(independent - (p + nuisance) / channels, 1e-9), 4.0)
+    return sigma_squared * inverse, inverse @ (freedom * middle) @ inverse
