@@ -87,11 +87,7 @@ def fit_equation_error(
         squares = float(residual @ residual)
     else:
         raise ValueError(f'equations is "all" or "scalar", not {equations!r}')
-    # z = λ' (ω_d − c)/s + b'  →  λ = λ'/s, b = b' − λ c
-    transform = np.zeros((6, 6))
-    transform[:3, :3] = np.diag(1.0 / spread)
-    transform[3:, 3:] = np.eye(3)
-    transform[3:, :3] = -np.diag(centre / spread)
+    transform = from_centred(centre, spread)
     constants = transform @ theta
     return GyroFit(
         scale=constants[:3],
@@ -125,6 +121,14 @@ def _covariances(sensitivity: Array, residual: Array, weight: Array) -> tuple[Ar
     """Cramér–Rao and coloured covariance (p, p) of one weighted regression."""
     root = np.sqrt(weight)
     return least_squares_covariance((sensitivity * root[:, None])[:, None, :], (residual * root)[:, None])
+
+
+def from_centred(centre: Array, spread: Array) -> Array:
+    """(6, 6) that takes (λ', b') fitted to (ω_d − c)/s to (λ, b): λ = λ'/s, b = b' − λ c."""
+    transform = np.eye(6)
+    transform[:3, :3] = np.diag(1.0 / spread)
+    transform[3:, :3] = -np.diag(centre / spread)
+    return transform
 
 
 def predicted_quaternion_rate(q: ArrayLike, rate: ArrayLike) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldcal.errors import EstimationError
-from fieldcal.gyro_equation import GyroFit
+from fieldcal.gyro_equation import GyroFit, from_centred
 from fieldcal.rotation import (
     Array,
     body_from_inertial,
@@ -235,10 +235,7 @@ def fit_output_error(
                     information = walk_information(sensitivity * weight[:, None, None], dt, first, walk)
                     inverse = np.linalg.pinv(normal, hermitian=True)
                     covariance = (1.0 - share) * covariance + inverse @ information @ inverse
-            transform = np.zeros((6, 6))
-            transform[:3, :3] = np.diag(1.0 / x_scale)
-            transform[3:, 3:] = np.eye(3)
-            transform[3:, :3] = -np.diag(centre / x_scale)
+            transform = from_centred(centre, x_scale)
             constants = transform @ theta
             return GyroFit(
                 scale=constants[:3],

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from fieldcal.attitude import attitude_covariance
-from fieldcal.gyro_equation import GyroFit
+from fieldcal.gyro_equation import GyroFit, from_centred
 from fieldcal.gyro_output import attitude_error, attitude_sensitivity, shooting_segments
 from fieldcal.gyro_output import without_stretch_means as project
 from fieldcal.rotation import Array, body_from_inertial, skew
@@ -78,8 +78,5 @@ def constants_to_gyro(
         moved = (r_nb @ jacobian[thin]).reshape(-1, 6)
         gain = np.linalg.solve(normal, weighted.T @ moved)
         total += gain @ covariance @ gain.T
-    transform = np.zeros((6, 6))
-    transform[:3, :3] = np.diag(1.0 / spread)
-    transform[3:, 3:] = np.eye(3)
-    transform[3:, :3] = -np.diag(centre / spread)
+    transform = from_centred(centre, spread)
     return np.asarray(transform @ total @ transform.T)

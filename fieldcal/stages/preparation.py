@@ -98,8 +98,8 @@ def smooth(tables: Tables, s: Settings) -> StageResult:
     return StageResult({"samples": samples}, measured={"n_samples": len(samples)})
 
 
-def _magnetometer_at(tables: Tables, stamps: np.ndarray, longest_hold_s: float = 1.0) -> Array:
-    """Magnetometer at the IMU's stamps, (n, 3), linear between its own; NaN when there is none, or past its ends."""
+def _magnetometer_at(tables: Tables, stamps: np.ndarray) -> Array:
+    """Magnetometer at the IMU's stamps, (n, 3), linear between its own, held past its ends; NaN when there is none."""
     magnetometer = tables.get("magnetometer")
     if magnetometer is None or len(magnetometer) < 2:
         return np.full((len(stamps), 3), np.nan)
