@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 import fieldcal
+from flows.cli_drift import drift
 from flows.cli_simulate import simulate
 from flows.interrupt import interruptible
 
@@ -325,6 +326,7 @@ def _assignments(texts: list[str]) -> dict[str, str]:
 
 
 app.command(simulate)
+app.command(drift)
 
 if __name__ == "__main__":
     main()
