@@ -149,3 +149,58 @@ def test_the_command_shows_what_is_not_stable_first(root: Path, capsys: pytest.C
     assert run(["drift", "--warehouse", str(root)]) == 0
     assert "Stepped by" in capsys.readouterr().out
     assert run(["drift", "--warehouse", str(root / "none")]) == 1
+
+
+def test_what_to_fly_with_is_the_trend_unless_the_last_flight_is_off_it(root: Path) -> None:
+    latest = Warehouse(root).sql("FROM latest_calibration WHERE sensor = 'gyroscope' AND axis = 'x'")
+    table = Warehouse(root).scan("drift").filter(sensor="gyroscope", axis="x").collect()
+    found = {row["imu_id"]: row for row in latest.iter_rows(named=True)}
+    trend = {row["imu_id"]: row for row in table.iter_rows(named=True)}
+    for imu_id in ("imu-00", "imu-01", "imu-02", "imu-03", "imu-05"):
+        assert found[imu_id]["source"] == "drift"
+        assert found[imu_id]["value_at_25degc"] == trend[imu_id]["value_at_25degc"]
+    assert "after the step of" in found["imu-00"]["why"]
+    assert "drifting, as of" in found["imu-01"]["why"]
+    assert "unlike the rest of the fleet" in found["imu-02"]["why"]
+    assert found["imu-05"]["why"] == f"Trend of {trend['imu-05']['n_flights']} flights."
+    odd = found["imu-04"]
+    assert odd["source"] == "flight"
+    assert "spoiled, or the first after a step" in odd["why"]
+    own = Warehouse(root).scan("calibration", flight_id=odd["flight_id"]).filter(sensor="gyroscope", axis="x").collect()
+    warmer = trend["imu-04"]["slope_per_degc"] * (own["temperature_degc"][0] - 25.0)
+    assert odd["value_at_25degc"] == pytest.approx(own["value"][0] - warmer, rel=1e-12)
+    # At the temperature of the flight it is the flight's own value and sd.
+    at = Warehouse(root).sql(
+        "FROM calibration_at((SELECT any_value(temperature_degc) FROM calibration WHERE flight_id = ?))"
+        " WHERE imu_id = 'imu-04' AND sensor = 'gyroscope' AND axis = 'x'",
+        [odd["flight_id"]],
+    )
+    assert at["value"][0] == pytest.approx(own["value"][0], rel=1e-12)
+    assert at["sd"][0] == pytest.approx(own["sd"][0], rel=1e-6)
+
+
+def test_the_sd_at_a_temperature_is_least_where_flights_were(root: Path) -> None:
+    sd = [
+        Warehouse(root).sql(f"FROM calibration_at({t}) WHERE imu_id = 'imu-05' AND sensor = 'gyroscope'")["sd"][0]
+        for t in (-40.0, 17.5, 80.0)
+    ]
+    assert sd[1] < 0.5 * min(sd[0], sd[2])
+    why = Warehouse(root).sql("FROM calibration_at(80) WHERE imu_id = 'imu-05'")["why"][0]
+    assert "80.0 degC is outside the " in why
+
+
+def test_a_flight_newer_than_the_trend_is_not_hidden(tmp_path: Path) -> None:
+    """The night has published a flight and not yet its trends."""
+    published = publish_fleet(tmp_path, units=1)["v00"]
+    update_drift(tmp_path)
+    last = published.filter(pl.col("session_id") == f"s{SESSIONS - 1:03d}")
+    new = last.with_columns(
+        value=pl.col("value") + STEP,
+        flight_id=pl.lit("new"),
+        session_id=pl.lit("new"),
+        started_at=pl.col("started_at") + pl.duration(days=7),
+    )
+    publish(tmp_path, "v00", {"calibration": new}, ["new"])
+    latest = Warehouse(tmp_path).sql("FROM latest_calibration")
+    assert set(latest["source"]) == {"flight"}
+    assert set(latest["flight_id"]) == {"new"}
