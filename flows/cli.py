@@ -12,6 +12,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 import fieldcal
 from flows.cli_drift import drift
+from flows.cli_fly import apply, export
 from flows.cli_simulate import simulate
 from flows.interrupt import interruptible
 
@@ -327,6 +328,8 @@ def _assignments(texts: list[str]) -> dict[str, str]:
 
 app.command(simulate)
 app.command(drift)
+app.command(export)
+app.command(apply)
 
 if __name__ == "__main__":
     main()
