@@ -436,3 +436,14 @@ def statuses(trends: Trends, fleet_p: Array) -> np.ndarray:
     status[enough & drifting & (trends.moved > 1.0)] = "drifting"
     status[enough & np.isfinite(trends.change_size)] = "step"
     return status
+
+
+def pooled(h: Histories) -> tuple[Array, Array]:
+    """Mean of each history and its sd (g,), scatter between sessions estimated and included: no slopes, no steps."""
+    row = np.asarray(h.row)
+    n_rows = int(row[-1]) + 1
+    grouping = _grouping(row, np.asarray(h.session), n_rows)
+    scale, y, variance = _scaled(h, row, n_rows)
+    fit = fit_random_effects(grouping, np.ones((len(y), 1)), y, variance, np.ones(len(y), dtype=bool))
+    mean = scale[:, 0] + scale[:, 1] * fit.coefficients[:, LEVEL]
+    return mean, scale[:, 1] * np.sqrt(fit.covariance[:, LEVEL, LEVEL])

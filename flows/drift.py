@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import polars as pl
 from fieldcal import drift, fleet
 from flows.ask import existing
 from flows.drift_reasons import reason
+from flows.drift_warm_up import known_slopes
 from schemas import TABLES
 from warehouse import Warehouse
 from warehouse.layout import history_files, vehicle_of
@@ -45,7 +47,11 @@ def update_drift(root: Path) -> tuple[str, ...]:
 
 def drift_table(root: Path) -> pl.DataFrame:
     """The table `drift` as the history has it now; nothing is written."""
-    flights = history_of_everything(root)
+    return table_of(history_of_everything(root))
+
+
+def table_of(flights: pl.DataFrame) -> pl.DataFrame:
+    """The table `drift` of `history_of_everything`'s rows."""
     if flights.is_empty():
         return empty_frame("drift")
     rows, trends = trends_of(flights)
@@ -145,6 +151,8 @@ def trends_of(flights: pl.DataFrame) -> tuple[pl.DataFrame, drift.Trends]:
         temperature_min_degc=pl.col("temperature_degc").min(),
         temperature_max_degc=pl.col("temperature_degc").max(),
     )
+    if (known := known_slopes(flights, kept, rows, trends)) is not None:
+        trends = drift.analyse(replace(kept, slope_per_degc=known[0], slope_per_degc_sd=known[1]))
     # A flight set aside is not what the line is as of.
     last = numbered.filter(pl.Series(trends.kept)).group_by("row").agg(as_of=pl.col("started_at").last())
     return rows.join(last, on="row", how="left", maintain_order="left"), trends

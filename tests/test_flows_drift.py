@@ -204,3 +204,33 @@ def test_a_flight_newer_than_the_trend_is_not_hidden(tmp_path: Path) -> None:
     latest = Warehouse(tmp_path).sql("FROM latest_calibration")
     assert set(latest["source"]) == {"flight"}
     assert set(latest["flight_id"]) == {"new"}
+
+
+def test_warm_up_flights_sharpen_the_slope_unless_they_contradict(tmp_path: Path) -> None:
+    """Slopes of the zero from two flights: x agrees with the sessions and is combined, y does not and is left out."""
+    published = publish_fleet(tmp_path, units=1)["v00"]
+    alone = {r["axis"]: r for r in drift_table(tmp_path).filter(sensor="gyroscope").iter_rows(named=True)}
+    scale = 3e-4
+    some = published.filter(pl.col("session_id").is_in(["s004", "s019"]), pl.col("sensor") == "gyroscope")
+    slope = {"x": -PER_DEGC / scale, "y": -5.0 * PER_DEGC / scale}
+    warm = some.filter(pl.col("axis").is_in(["x", "y"])).with_columns(
+        method=pl.lit("warm_up"),
+        parameter=pl.lit("zero_per_degc"),
+        unit=pl.lit("counts/degC"),
+        value=pl.col("axis").replace_strict(slope, return_dtype=pl.Float64),
+        sd=pl.lit(0.02 * PER_DEGC / scale),
+    )
+    scales = published.filter(sensor="gyroscope").with_columns(
+        parameter=pl.lit("scale"), unit=pl.lit("rad/s/counts"), value=pl.lit(scale), sd=pl.lit(1e-7)
+    )
+    ids = published["flight_id"].unique().to_list()
+    publish(tmp_path, "v00", {"calibration": pl.concat([published, warm, scales])}, ids)
+    found = {
+        r["axis"]: r
+        for r in drift_table(tmp_path).filter(sensor="gyroscope", parameter="zero_bias").iter_rows(named=True)
+    }
+    assert found["x"]["slope_per_degc"] == pytest.approx(PER_DEGC, rel=0.05)
+    assert found["x"]["slope_per_degc_sd"] < 0.5 * alone["x"]["slope_per_degc_sd"]
+    assert found["x"]["sd"] < alone["x"]["sd"] * 1.01
+    for axis in "yz":
+        assert found[axis]["slope_per_degc"] == pytest.approx(alone[axis]["slope_per_degc"], rel=1e-9)
