@@ -10,18 +10,21 @@ share of false alarms is controlled over all of them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
 from fieldcal.change_points import isolated, scatter_variance, strongest_step, temperature_slope
+from fieldcal.fleet import moderated_variance
 from fieldcal.random_effects import Grouping, Regression, fit_random_effects
 from fieldcal.rotation import Array
 
 REFERENCE_DEGC = 25.0
 FALSE_ALARMS = 0.01
-"""Share of the alarms of one kind (drift, step, outlier) that may be false, over all rows (Benjamini and Hochberg)."""
+"""Share of the alarms of one kind (drift, step) that may be false, over all rows (Benjamini and Hochberg)."""
+FALSE_OUTLIERS = 0.05
+"""The same for outliers among siblings, which claim less: nothing has changed."""
 ENOUGH_SESSIONS = 5
 """Fewer sessions than this are no trend: level, two slopes, and something left to judge them by."""
 TEMPERATURE_SPAN_DEGC = 2.0
@@ -43,7 +46,7 @@ class Histories:
     `row` (n,) counts histories from 0, ascending; `session` (n,) labels flights of the same session within a row;
     `time_day` and `temperature_degc` (n,) are NaN where unknown, `sd` (n,) too; `value` (n,) is finite.
     `slope_per_degc`, `slope_per_degc_sd` (g,), optional: what warm-up flights say of the slope by themselves, NaN
-    where nothing.
+    where nothing. `kind` (g,), optional: equal for siblings, whose scatter is alike.
     """
 
     row: np.ndarray
@@ -54,6 +57,7 @@ class Histories:
     sd: Array
     slope_per_degc: Array | None = None
     slope_per_degc_sd: Array | None = None
+    kind: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -117,6 +121,8 @@ def analyse(h: Histories) -> Trends:
     design = np.column_stack([columns.design, _step_columns(grouping, step_session)])
     known, known_variance = _known(h, columns, scale, design.shape[1], n_rows)
     fit = fit_random_effects(grouping, design, y, variance, keep, known=known, known_variance=known_variance)
+    if h.kind is not None:
+        fit = _among_siblings(fit, h, scale, variance, keep, enough)
     return _told(h, grouping, columns, design, y, variance, keep, usable, enough, scale, fit, step_session, step_p)
 
 
@@ -280,6 +286,25 @@ def _known(
     return known, variance
 
 
+def _among_siblings(
+    fit: Regression, h: Histories, scale: Array, variance: Array, keep: np.ndarray, enough: np.ndarray
+) -> Regression:
+    """The scatter of each row, claims included, drawn towards its siblings' (`fleet.moderated_variance`)."""
+    g = len(enough)
+    own = np.bincount(h.row, keep * variance, g) / np.maximum(np.bincount(h.row, keep, g), 1) + fit.flight_variance
+    kinds, kind = np.unique(np.asarray(h.kind), return_inverse=True)
+    total = np.where(enough, fit.session_variance + own, np.nan)
+    unit = scale[:, 1] ** 2
+    moderated, freedom = moderated_variance(kind, total * unit, fit.freedom, len(kinds))
+    ratio = np.where(enough, moderated / unit / total, 1.0)
+    return replace(
+        fit,
+        covariance=fit.covariance * ratio[:, None, None],
+        session_variance=np.where(enough, np.maximum(moderated / unit - own, 0.0), fit.session_variance),
+        freedom=np.where(enough, freedom, fit.freedom),
+    )
+
+
 def _told(
     h: Histories,
     grouping: Grouping,
@@ -430,7 +455,7 @@ def statuses(trends: Trends, fleet_p: Array) -> np.ndarray:
     status = np.full(len(enough), "insufficient", dtype=object)
     drifting, outlier = np.zeros(len(enough), dtype=bool), np.zeros(len(enough), dtype=bool)
     drifting[enough] = alarms(trends.drift_p[enough])
-    outlier[enough] = alarms(fleet_p[enough])
+    outlier[enough] = alarms(fleet_p[enough], FALSE_OUTLIERS)
     status[enough] = "stable"
     status[enough & outlier] = "outlier"
     status[enough & drifting & (trends.moved > 1.0)] = "drifting"

@@ -145,12 +145,14 @@ def trends_of(flights: pl.DataFrame) -> tuple[pl.DataFrame, drift.Trends]:
         value=flights["value"].to_numpy(),
         sd=flights["sd"].to_numpy(),
     )
-    trends = drift.analyse(kept)
     rows = numbered.group_by("row", maintain_order=True).agg(
         *(pl.col(name).last() for name in (*KEY, "vehicle_id", "unit")),
         temperature_min_degc=pl.col("temperature_degc").min(),
         temperature_max_degc=pl.col("temperature_degc").max(),
     )
+    siblings = rows.select(pl.struct("sensor", "method", "parameter", "unit").rank("dense")).to_series()
+    kept = replace(kept, kind=siblings.to_numpy())
+    trends = drift.analyse(kept)
     if (known := known_slopes(flights, kept, rows, trends)) is not None:
         trends = drift.analyse(replace(kept, slope_per_degc=known[0], slope_per_degc_sd=known[1]))
     # A flight set aside is not what the line is as of.
