@@ -1,7 +1,7 @@
 """One SELECT over the history in DuckDB, locked down: no files, no network, no settings, bounded in memory and time.
 
-The engine never opens a file: it reads Arrow datasets that are made here and handed over, and only then is everything
-external switched off and the configuration locked.
+The engine may open the history's own files, named one by one, for reading; everything else external is switched off and
+the configuration locked before the query is looked at.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from typing import Any
 import duckdb
 import polars as pl
 import pyarrow as pa
-import pyarrow.dataset
 
 import schemas
 from schemas import HISTORY_TABLES
@@ -62,11 +61,16 @@ def run_sql(
         `sql_timeout`, `sql_too_large`.
     """
     with duckdb.connect(":memory:", config={**_CONFIG, "memory_limit": f"{memory_mb}MB"}) as connection:
+        paths = {table: history_files(root, table) for table in HISTORY_TABLES}
         for table in HISTORY_TABLES:
-            connection.register(table, _dataset(root, table))
+            if paths[table]:
+                connection.execute(_table_view(table, paths[table]))
+            else:
+                connection.register(table, schemas.arrow_schema(table).empty_table())
         for view in VIEWS:
             connection.execute((files("warehouse") / "views" / f"{view}.sql").read_text(encoding="utf-8"))
         connection.execute("SET TimeZone = 'UTC'")
+        connection.execute(f"SET allowed_paths = {_listed([path for own in paths.values() for path in own])}")
         connection.execute("SET enable_external_access = false")
         connection.execute("SET lock_configuration = true")
         with _sentences(timeout_s, memory_mb), _time_limit(connection, timeout_s):
@@ -74,17 +78,23 @@ def run_sql(
             return _result(connection.sql(statement, params=parameters), max_result_mb)
 
 
-def _dataset(root: Path, table: str) -> pa.dataset.Dataset:
-    """The table's files, each known by its vehicle, so that a query for one vehicle opens one file."""
-    schema = schemas.arrow_schema(table).remove_metadata()
-    parquet = pa.dataset.ParquetFileFormat()
-    filesystem = pa.fs.LocalFileSystem()
-    fragments = []
-    for path in history_files(root, table):
-        vehicle_id = vehicle_of(path)
-        known = None if vehicle_id is None else pa.dataset.field("vehicle_id") == vehicle_id
-        fragments.append(parquet.make_fragment(str(path), filesystem, partition_expression=known))
-    return pa.dataset.FileSystemDataset(fragments, schema, parquet, filesystem)
+def _table_view(table: str, paths: Sequence[Path]) -> str:
+    """A view over a table's files. Where folders tell the vehicles exactly, a query for one vehicle opens one file.
+
+    Columns are qualified: inside a macro a bare name would be the macro's parameter.
+    """
+    by_folder = all(vehicle_of(path) for path in paths)
+    how = (
+        "hive_partitioning = true, hive_types = {'vehicle_id': 'VARCHAR'}" if by_folder else "hive_partitioning = false"
+    )
+    columns = ", ".join(f'f."{name}"' for name in schemas.TABLES[table].column_names)
+    return f"CREATE VIEW {table} AS SELECT {columns} FROM read_parquet({_listed(paths)}, {how}) AS f"
+
+
+def _listed(paths: Sequence[Path]) -> str:
+    """Absolute paths as a SQL list; a quote in one is doubled."""
+    quoted = ("'" + str(path.absolute()).replace("'", "''") + "'" for path in paths)
+    return f"[{', '.join(quoted)}]"
 
 
 def _one_reading_statement(connection: duckdb.DuckDBPyConnection, query: str) -> duckdb.Statement:
