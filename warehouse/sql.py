@@ -7,7 +7,7 @@ the configuration locked before the query is looked at.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
@@ -23,9 +23,11 @@ from warehouse.errors import WarehouseError
 from warehouse.layout import history_files, vehicle_of
 from warehouse.store import frame
 
+# In the order in which they are made: later ones may need earlier ones.
 VIEWS = ("latest_calibration", "history", "drift_by_temperature", "worst_tic", "refusals", "calibration_at")
 
 _READING = frozenset({"SELECT", "EXPLAIN"})
+_ABOUT_ALL = ("show", "describe", "summarize", "information_schema", "duckdb_", "pg_", "pragma_")
 _ROWS_PER_BATCH = 65_536
 _CONFIG: dict[str, str | bool | int | float | list[str]] = {
     "autoinstall_known_extensions": False,
@@ -60,20 +62,51 @@ def run_sql(
         `sql_refused` (not one SELECT, or it reaches outside), `sql_wrong` (syntax, unknown names, wrong types),
         `sql_timeout`, `sql_too_large`.
     """
+    texts = {view: (files("warehouse") / "views" / f"{view}.sql").read_text(encoding="utf-8") for view in VIEWS}
+    with _sentences(timeout_s, memory_mb):
+        try:
+            return _answer(root, query, parameters, _named(query, texts), timeout_s, memory_mb, max_result_mb)
+        except (
+            duckdb.CatalogException
+        ):  # a name that was not recognised in the text, or a mistake, best explained by all
+            return _answer(root, query, parameters, texts, timeout_s, memory_mb, max_result_mb)
+
+
+def _named(query: str, texts: Mapping[str, str]) -> dict[str, str]:
+    """The views that a query may need: those whose name is in its text, and what these need. Making them costs most."""
+    if any(word in query.lower() for word in _ABOUT_ALL):
+        return dict(texts)
+    named: dict[str, str] = {}
+    for view in reversed(VIEWS):
+        if view in query.lower() or any(view in text for text in named.values()):
+            named[view] = texts[view]
+    return dict(reversed(named.items()))
+
+
+def _answer(
+    root: Path,
+    query: str,
+    parameters: Sequence[Any] | None,
+    views: Mapping[str, str],
+    timeout_s: float,
+    memory_mb: int,
+    max_result_mb: int,
+) -> pl.DataFrame:
+    needed = "".join([query.lower(), *views.values()]) if len(views) < len(VIEWS) else "".join(HISTORY_TABLES)
     with duckdb.connect(":memory:", config={**_CONFIG, "memory_limit": f"{memory_mb}MB"}) as connection:
-        paths = {table: history_files(root, table) for table in HISTORY_TABLES}
-        for table in HISTORY_TABLES:
-            if paths[table]:
-                connection.execute(_table_view(table, paths[table]))
+        paths = {table: history_files(root, table) for table in HISTORY_TABLES if table in needed}
+        for table, own in paths.items():
+            if own:
+                connection.execute(_table_view(table, own))
             else:
                 connection.register(table, schemas.arrow_schema(table).empty_table())
-        for view in VIEWS:
-            connection.execute((files("warehouse") / "views" / f"{view}.sql").read_text(encoding="utf-8"))
+        for text in views.values():
+            connection.execute(text)
         connection.execute("SET TimeZone = 'UTC'")
         connection.execute(f"SET allowed_paths = {_listed([path for own in paths.values() for path in own])}")
         connection.execute("SET enable_external_access = false")
         connection.execute("SET lock_configuration = true")
-        with _sentences(timeout_s, memory_mb), _time_limit(connection, timeout_s):
+        with _time_limit(connection, timeout_s):
             statement = _one_reading_statement(connection, query)
             return _result(connection.sql(statement, params=parameters), max_result_mb)
 
