@@ -13,7 +13,7 @@ MOST_ROWS = 500
 
 
 def keep_artifact(result: Mapping[str, Any], root: Path) -> None:
-    """Keep the logs that are not `ok` or refused something, under the counts of the night. A lost server is no error."""
+    """Keep the logs that are not `ok` or refused something, under the night's counts. A lost server is no error."""
     from prefect.artifacts import create_table_artifact
 
     counts = ", ".join(f"{result[verdict]} {verdict}" for verdict in VERDICTS)
