@@ -11,6 +11,8 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 import fieldcal
+from flows.cli_drift import drift
+from flows.cli_fly import apply, export
 from flows.cli_serve import serve, trigger
 from flows.cli_simulate import simulate
 from flows.interrupt import interruptible
@@ -340,6 +342,9 @@ def _assignments(texts: list[str]) -> dict[str, str]:
 app.command(serve)
 app.command(trigger)
 app.command(simulate)
+app.command(drift)
+app.command(export)
+app.command(apply)
 
 if __name__ == "__main__":
     main()
