@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 import fieldcal
+from flows.cli_report import report
 from flows.cli_simulate import simulate
 from flows.interrupt import interruptible
 
@@ -324,6 +325,7 @@ def _assignments(texts: list[str]) -> dict[str, str]:
     return {name.strip(): value.strip() for name, _, value in pairs}
 
 
+app.command(report)
 app.command(simulate)
 
 if __name__ == "__main__":

@@ -191,8 +191,8 @@ def _figures(data: FlightData) -> list[Section]:
     if data.gone:
         parts.append(
             Notice(
-                f"The stored tables of {', '.join(data.gone)} are gone (stages/ may be deleted at any time), so some"
-                " figures are missing. Run fieldcal nightly ARCHIVE again to make them anew; the constants above do not change."
+                f"The stored tables of {', '.join(data.gone)} are gone (stages/ may be deleted at any time), so"
+                " some figures are missing. Run fieldcal nightly ARCHIVE again to make them anew; the constants above do not change."
             )
         )
     raw = draw.unprocessed(data.tables, data.units)

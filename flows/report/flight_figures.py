@@ -147,8 +147,8 @@ def _coverage(found: Mapping[str, Array]) -> Plot:
         axis.set_ylabel("sine of elevation")
         headed(axis, f"{name}: {100 * share:.0f} % of directions")
     caption = (
-        "Coverage of the spheres: directions sensed, in sensor axes. Every cell has the same solid angle; the stronger its"
-        f" colour, the more samples (logarithmic). Covered: {', '.join(told)}."
+        "Coverage of the spheres: directions sensed, in sensor axes. Every cell has the same solid angle; the stronger"
+        f" its colour, the more samples (logarithmic). Covered: {', '.join(told)}."
     )
     return Plot("figure-coverage", svg(figure, "figure-coverage", "Coverage of the spheres", caption), caption)
 

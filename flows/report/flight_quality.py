@@ -67,7 +67,8 @@ def spectra(c: Curves, samples: pl.DataFrame, calibration: pl.DataFrame, setting
         axis.set_xlabel("frequency (Hz)")
     caption = (
         "Residual spectra: amplitude spectral density of each step's residual (Welch, longest stretch without a gap;"
-        " channels summed). A rise at the manoeuvre's frequencies, below a few hertz, is a model error; a flat one is noise."
+        " channels summed). A rise at the manoeuvre's frequencies, below a few hertz, is a model error; what is"
+        " flat is noise."
     )
     return Plot("figure-spectra", svg(figure, "figure-spectra", "Residual spectra", caption), caption)
 

@@ -100,7 +100,7 @@ def _fly_with(warehouse: Warehouse, imu_id: str) -> list[Part]:
     ]
     return [
         Text(
-            "z = scale · logged + bias, sensor axes. A constant from a single flight holds at that flight's temperature."
+            "z = scale · logged + bias, sensor axes. A constant of one flight holds at its temperature."
         ),
         Table("Latest constants at 25 °C, ± one standard deviation (view latest_calibration)", columns, lines),
     ]

@@ -46,8 +46,8 @@ def parameter_plot(
     caption[0] += ", error bars ±1σ."
     if "trend" in told:
         caption.append(
-            f"Line and band: the regression of table drift ±{SIGMAS:.0f}σ; points on the left are reduced to 25 °C, on the"
-            " right to the time of the last flight."
+            f"Line and band: the regression of table drift ±{SIGMAS:.0f}σ; points on the left are reduced to 25 °C, on"
+            " the right to the time of the last flight."
         )
     else:
         caption.append("Values as estimated; table drift has no regression of it.")
@@ -291,7 +291,7 @@ def lag_plot(sync: pl.DataFrame, anchor: str) -> Plot | None:
     lag = 1e3 * good["lag_mid_s"].to_numpy()
     scatter = f"{np.std(lag, ddof=1):.3g} ms" if len(lag) > 1 else "unknown with one flight"
     caption = (
-        f"VPS clock + lag = IMU clock; error bars ±1σ. Scatter of the lag between flights (standard deviation): {scatter}."
+        f"VPS clock + lag = IMU clock; error bars ±1σ. Scatter of the lag between flights (sd): {scatter}."
         f" Last flight shown: {day(good['started_at'][-1])}."
     )
     return Plot(

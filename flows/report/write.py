@@ -48,7 +48,7 @@ def write_flight_report(root: Path, flight_id: str) -> Path:
 
 
 def write_night_reports(root: Path, vehicles: Collection[str], *, as_of: datetime | None = None) -> list[Path]:
-    """Write the pages of `vehicles` (those that changed) and the fleet's, linked to each other; the fleet's path first."""
+    """Write the pages of `vehicles` and the fleet's, linked to each other; paths, the fleet's first."""
     expected = frozenset({FLEET, *(vehicle_name(vehicle) for vehicle in vehicles)})
     own = [
         vehicle_report(root, vehicle, _place(root, vehicle_name(vehicle)), as_of=as_of, expected=expected)
