@@ -3,6 +3,7 @@
 from flows.report.write import (
     fleet_report,
     flight_report,
+    log_report,
     vehicle_report,
     write_fleet_report,
     write_flight_report,
@@ -13,6 +14,7 @@ from flows.report.write import (
 __all__ = [
     "fleet_report",
     "flight_report",
+    "log_report",
     "vehicle_report",
     "write_fleet_report",
     "write_flight_report",

@@ -15,11 +15,12 @@ from flows.report.links import Links, flight_name, vehicle_name
 from flows.report.page import Column, Notice, Page, Part, Section, Table, Text, badge
 from flows.report.plot import sparkline
 from flows.report.trend import STATUSES, change_sentence, worst_status
-from flows.report.words import PARAMETERS, age, count, day, plain_name, preferred, unit, with_unit
+from flows.report.words import PARAMETERS, age, count, day, plain_name, preferred, scientific, unit, with_unit
 from flows.show import number
 from warehouse import Warehouse
 
 LOOKS = 200
+NOT_ANALYSED = "not analysed"
 POINTS = 60
 
 _COLUMNS = (
@@ -48,13 +49,13 @@ def fleet_page(root: Path, links: Links, as_of: datetime | None) -> Page:
     worst = _worst_tics(warehouse, last)
     sparks = _sparks(warehouse, drift)
     own_drift = {key[0]: part for key, part in drift.partition_by("vehicle_id", as_dict=True).items()}
-    rows, statuses = [], dict.fromkeys(STATUSES, 0)
+    rows, statuses = [], dict.fromkeys((*STATUSES, NOT_ANALYSED), 0)
     for key, part in (
         flights.sort("vehicle_id", "started_at", "flight_id").partition_by("vehicle_id", as_dict=True).items()
     ):
         vehicle = str(key[0])
         status = worst_status(own_drift.get(vehicle))
-        statuses[status or "insufficient"] += 1
+        statuses[status or NOT_ANALYSED] += 1
         rows.append(
             _row(vehicle, part, status, last.get(vehicle), worst.get(vehicle), sparks.get(vehicle), links, moment)
         )
@@ -104,7 +105,7 @@ def _row(
     return [
         links.to(vehicle_name(vehicle), vehicle),
         str(latest["imu_id"]),
-        badge(status or "not analysed"),
+        badge(status or NOT_ANALYSED),
         badge(latest["verdict"]),
         "none" if last is None else links.to(flight_name(last["flight_id"]), day(last["started_at"])),
         "–" if last is None else age(last["started_at"], as_of),
@@ -162,7 +163,7 @@ def _sparks(warehouse: Warehouse, drift: pl.DataFrame) -> dict[str, tuple[str, s
         span = f"{number(values[0])} to {number(values[-1])} {own_unit}".strip()
         label = f"{name} over {count(len(values), 'flight')}: {span}"
         told[str(vehicle)] = (
-            f"{name}: {with_unit(number(values[-1]), shown['unit'][-1])}",
+            f"{name}: {with_unit(scientific(values[-1]), shown['unit'][-1])}",
             sparkline(values, after[0] if after and after[0] else None, label),
         )
     return told

@@ -91,8 +91,11 @@ def _refusals(data: FlightData) -> list[Part]:
     follow = [row["stage"] for row in stopped if is_consequence(row)]
     if follow:
         parts.append(Text(f"Not run for want of their input: {', '.join(follow)}."))
-    noted = [row for row in data.run if row["status"] == "ok" and row["reason_code"]]
-    parts += [Text(f"{row['stage']}: {row['measured'].get('reason') or row['reason_code']}") for row in noted]
+    noted: dict[str, list[str]] = {}
+    for row in data.run:
+        if row["status"] == "ok" and row["reason_code"]:
+            noted.setdefault(str(row["measured"].get("reason") or row["reason_code"]), []).append(row["stage"])
+    parts += [Text(f"{', '.join(stages)}: {reason}") for reason, stages in noted.items()]
     return parts or [Text("Nothing was refused, and the log was read whole.")]
 
 
@@ -130,10 +133,10 @@ def _paper_table(rows: Sequence[Mapping[str, Any]], caption: str, letter: str) -
     for parameter, axis in places:
         own = [by_place.get((parameter, axis, method)) for method in methods]
         known = next(r for r in own if r is not None)
-        states = sorted(
-            {f"{r['status']}: {r['reason_code']}" if r["status"] != "ok" else "ok" for r in own if r is not None}
-        )
-        state = badge("ok") if states == ["ok"] else ", ".join(states)
+        refused = [
+            f"{plain_name(r['method'])} {r['status']}: {r['reason_code']}" for r in own if r and r["status"] != "ok"
+        ]
+        state = "; ".join(refused) or badge("ok")
         symbol = f"{SYMBOLS.get(parameter, parameter)} {letter}{axis}"
         values = ["–" if r is None else scientific(r["value"], r["sd"]) for r in own]
         lines.append([symbol, *values, unit(known["unit"]), state])
@@ -191,8 +194,9 @@ def _figures(data: FlightData) -> list[Section]:
     if data.gone:
         parts.append(
             Notice(
-                f"The stored tables of {', '.join(data.gone)} are gone (stages/ may be deleted at any time), so"
-                " some figures are missing. Run fieldcal nightly ARCHIVE again to make them anew; the constants above do not change."
+                f"The stored tables of {', '.join(data.gone)} are gone (stages/ may be deleted at any time), so some"
+                " figures are missing. Run fieldcal nightly ARCHIVE again to make them anew; the constants above do"
+                " not change."
             )
         )
     raw = draw.unprocessed(data.tables, data.units)

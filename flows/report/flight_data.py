@@ -12,7 +12,10 @@ import polars as pl
 from fieldcal.errors import FieldcalError
 from fieldcal.pipeline import PIPELINE
 from flows.ask import existing
+from flows.calibrate import CalibratedLog
+from flows.rows import rows_frame
 from flows.show import rows_of, unfolded
+from flows.steps import plain
 from schemas import SIGNAL_TABLES, SchemaMismatch
 from warehouse import Warehouse, WarehouseError
 from warehouse.stage_store import StageStore
@@ -76,6 +79,20 @@ def read_flight(root: Path, flight_id: str) -> FlightData:
         tables | stages,
         settings,
         gone,
+    )
+
+
+def of_log(log: CalibratedLog) -> FlightData:
+    """A flight calibrated in memory, without a warehouse."""
+    document = log.document
+    return FlightData(
+        document["flight"],
+        rows_frame("calibration", document["calibration"]),
+        document["fit"],
+        document["sync"],
+        document["run"],
+        log.tables,
+        plain(log.settings),
     )
 
 

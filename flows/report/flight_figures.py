@@ -12,7 +12,7 @@ from fieldcal.frames import QUATERNION, matrix, seconds, triad
 from fieldcal.rotation import Array, continuous, euler_angles
 from flows.report.flight_curves import Curves, covered_cells, lengths
 from flows.report.page import Plot
-from flows.report.plot import INK, XYZ, backdrop, curve, headed, legend, panels, solid_panels, svg
+from flows.report.plot import INK, XYZ, backdrop, curve, headed, legend, panels, solid_panels, svg, without_wraps
 from flows.report.words import unit
 
 SPHERE_POINTS = 1500
@@ -50,6 +50,8 @@ def unprocessed(tables: Mapping[str, pl.DataFrame], units: Mapping[str, str]) ->
     if len(shown) > len(signals):
         axis = axes.flat[len(signals)]
         orientation = _orientation(axis, aligned, logged, origin)
+        if signals and aligned is not None:
+            axis.set_xlim(axes.flat[0].get_xlim())
     for axis in axes[-1]:
         axis.set_xlabel("time (s)")
     caption = f"Figure 5. Unprocessed readings.{orientation}"
@@ -63,7 +65,7 @@ def _orientation(axis: Any, aligned: pl.DataFrame | None, logged: pl.DataFrame |
     if aligned is not None and not aligned.is_empty():
         t, angles = seconds(aligned["t_ns"], origin), euler_angles(continuous(matrix(aligned, QUATERNION)))
         for i, (name, colour) in enumerate(zip(("φ", "θ", "ψ"), XYZ, strict=True)):
-            curve(axis, t, angles[:, i], colour, label=name, width=0.8)
+            curve(axis, t, without_wraps(angles[:, i]), colour, label=name, width=0.8)
         headed(axis, "VPS orientation (rad)")
         legend(axis)
         return " Orientation: the VPS, put on the IMU's clock."
@@ -99,6 +101,8 @@ def spheres(samples: pl.DataFrame, calibration: pl.DataFrame, settings: Mapping[
         axis.set_visible(False)
     for axis, (name, vectors) in zip(axes, found.items(), strict=False):
         radius, own_unit = radii[name]
+        if own_unit == "T":
+            radius, own_unit, vectors = 1e6 * radius, "µT", 1e6 * vectors
         ball = radius * np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
         axis.plot_wireframe(*ball, color=INK["muted"], linewidth=0.3, alpha=0.6)
         thin = vectors[:: -(-len(vectors) // SPHERE_POINTS)]

@@ -62,7 +62,7 @@ def spectra(c: Curves, samples: pl.DataFrame, calibration: pl.DataFrame, setting
             assert spectrum is not None
             axis.loglog(*_by_octave_shares(*spectrum), color=colour, linewidth=1.0, label=name)
         headed(axis, f"{title} ({per})")
-        legend(axis)
+        legend(axis, 1, inside="lower left")
     for axis in list(axes.flat)[max(0, len(shown) - 2) : len(shown)]:
         axis.set_xlabel("frequency (Hz)")
     caption = (

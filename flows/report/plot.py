@@ -126,6 +126,7 @@ def _themed(text: str, name: str, title: str, description: str) -> str:
     for variable, colour in INK.items():
         text = text.replace(colour, f"var(--{variable})")
     text = re.sub(r"\n\s*", "\n", text)
+    text = re.sub(r"<g([^>]*)>\n((?:<use [^>]*/>\n)+)</g>", _one_style, text)
     box = re.search(r'viewBox="([^"]*)"', text)
     size = box[1] if box else "0 0 1 1"
     opening = (
@@ -134,6 +135,15 @@ def _themed(text: str, name: str, title: str, description: str) -> str:
         f'<desc id="{own}-d">{escape(description)}</desc>'
     )
     return re.sub(r"^<svg[^>]*>", lambda _: opening, text, count=1).rstrip()
+
+
+def _one_style(group: re.Match[str]) -> str:
+    """Markers of one group with their common style said once."""
+    styles = set(re.findall(r' style="([^"]*)"', group[2]))
+    if len(styles) != 1:
+        return group[0]
+    marks = re.sub(r' style="[^"]*"', "", group[2])
+    return f'<g{group[1]} style="{styles.pop()}">\n{marks}</g>'
 
 
 def _short(number: re.Match[str]) -> str:
@@ -146,11 +156,11 @@ def headed(axis: Axes, text: str) -> None:
     axis.set_title(text, loc="left", fontsize=9, color=INK["fg"])
 
 
-def legend(axis: Axes, columns: int = 4) -> None:
-    """Name a panel's curves, above its right corner, where no curve is."""
+def legend(axis: Any, columns: int = 4, *, inside: str | None = None) -> None:
+    """Name a panel's curves: above its right corner, where no curve is, or at a place `inside`."""
     axis.legend(
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
+        loc=inside or "lower right",
+        bbox_to_anchor=(0.0, 0.0, 1.0, 1.0) if inside else (1.0, 1.0),
         ncols=columns,
         fontsize=8,
         frameon=False,
@@ -172,6 +182,13 @@ def curve(
 def backdrop(axis: Axes, t: Array, x: Array, label: str) -> None:
     """The curve that others are compared with: broad and pale, so that a thin one shows on it."""
     axis.plot(*thinned(*with_gaps(t, x)), color=INK["c1"], alpha=0.4, label=label, linewidth=3.2)
+
+
+def without_wraps(angle: Array) -> Array:
+    """Angles (n,) in rad with a NaN in place of each sample after a jump of more than π: no line runs across it."""
+    out = angle.copy()
+    out[1:][np.abs(np.diff(angle)) > np.pi] = np.nan
+    return out
 
 
 def with_gaps(t: Array, x: Array) -> tuple[Array, Array]:

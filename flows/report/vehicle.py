@@ -15,12 +15,12 @@ from flows.report.history import as_of_sentence, newest, reason_of, unfold, usab
 from flows.report.links import Links, flight_name
 from flows.report.page import Column, Folded, Heading, Notice, Page, Part, Section, Simple, Table, Text, badge
 from flows.report.trend import STATUSES, fly_with_sentence, worst_status
-from flows.report.vehicle_figures import agreement_plot, lag_plot, parameter_plot
+from flows.report.vehicle_figures import MOST_POINTS, agreement_plot, lag_plot, parameter_plot
 from flows.report.words import PARAMETERS, SENSORS, age, count, day, plain_name, preferred, scientific, unit
 from flows.show import number
 from warehouse import Warehouse
 
-FLIGHTS, REFUSALS = 200, 100
+FLIGHTS, REFUSALS, FEWEST_POINTS = 200, 100, 30
 OPEN = ("scale", "zero_bias")
 """Parameters whose plots are open; the others say the same in other words."""
 
@@ -99,9 +99,7 @@ def _fly_with(warehouse: Warehouse, imu_id: str) -> list[Part]:
         Column("from", "wide"),
     ]
     return [
-        Text(
-            "z = scale · logged + bias, sensor axes. A constant of one flight holds at its temperature."
-        ),
+        Text("z = scale · logged + bias, sensor axes. A constant of one flight holds at its temperature."),
         Table("Latest constants at 25 °C, ± one standard deviation (view latest_calibration)", columns, lines),
     ]
 
@@ -195,6 +193,8 @@ def _parameters(warehouse: Warehouse, vehicle_id: str, imus: list[str], drift: p
         .sort("started_at", "flight_id", nulls_last=False)
         .collect()
     )
+    panels = max(3 * len(imus), rows.select("imu_id", "axis").unique().height)
+    most = max(FEWEST_POINTS, 3 * MOST_POINTS // panels)
     sections: list[Section] = []
     for sensor in sorted(rows["sensor"].unique().to_list(), key=lambda name: _place(SENSORS, name)):
         parts: list[Part] = []
@@ -204,12 +204,12 @@ def _parameters(warehouse: Warehouse, vehicle_id: str, imus: list[str], drift: p
                 continue
             if len(imus) > 1:
                 parts.append(Heading(f"IMU {imu}"))
-            parts += _sensor(own, drift.filter(pl.col("sensor") == sensor, pl.col("imu_id") == imu), vehicle_id)
+            parts += _sensor(own, drift.filter(pl.col("sensor") == sensor, pl.col("imu_id") == imu), vehicle_id, most)
         sections.append(Section(f"sensor-{len(sections) + 1}", sensor.capitalize(), parts))
     return sections
 
 
-def _sensor(rows: pl.DataFrame, drift: pl.DataFrame, vehicle_id: str) -> list[Part]:
+def _sensor(rows: pl.DataFrame, drift: pl.DataFrame, vehicle_id: str, most: int) -> list[Part]:
     method = preferred(set(rows["method"].to_list()))
     rows = rows.filter(pl.col("method") == method)
     sensor, imu = rows["sensor"][0], rows["imu_id"][0]
@@ -221,7 +221,7 @@ def _sensor(rows: pl.DataFrame, drift: pl.DataFrame, vehicle_id: str) -> list[Pa
         trend = drift.filter(pl.col("method") == method, pl.col("parameter") == parameter)
         by_axis = {r["axis"]: r for r in trend.iter_rows(named=True) if r["status"] != "insufficient"}
         anchor = f"plot-{_slug(sensor, parameter, imu)}"
-        plot = parameter_plot(own, by_axis, vehicle_id, f"{sensor} {parameter}", anchor)
+        plot = parameter_plot(own, by_axis, vehicle_id, f"{sensor} {parameter}", anchor, most)
         (parts if parameter in OPEN else folded).append(plot)
     if folded:
         parts.append(Folded(f"The same as {' and '.join(p for p in there if p not in OPEN)}", folded))

@@ -12,121 +12,107 @@ import polars as pl
 from fieldcal.rotation import Array
 from flows.report.page import Plot
 from flows.report.plot import INK, XYZ, headed, legend, panels, svg
-from flows.report.trend import days_after, predicted
+from flows.report.trend import REFERENCE_DEGC, days_after, predicted
 from flows.report.words import count, day, unit
 
-MOST_POINTS = 400
+MOST_POINTS = 250
+"""Flights in a panel; fewer where a page has more panels."""
+
 SIGMAS = 2.0
 MARGIN = 0.15
 _ROW_IN = 1.35
 
 
+TOLD = {
+    "trend": f"Line and band: the regression of table drift ±{SIGMAS:.0f}σ; points against time are reduced to 25 °C,"
+    " those against temperature to the time of the last flight.",
+    "plain": "Values as estimated; table drift has no regression of it.",
+    "step": "Dashed vertical line: detected step; grey points lie before it.",
+    "refused": "Crosses: refused, not used.",
+    "outside": "Triangles: beyond the panel.",
+    "elsewhere": "Open circles: the same IMU on another vehicle.",
+    "undated": "Flights without a known date are at the left edge.",
+    "cold": "The logs have no temperature.",
+}
+"""What a caption says of what its figure shows."""
+
+
 def parameter_plot(
-    rows: pl.DataFrame, drift: Mapping[str, Mapping[str, Any]], vehicle_id: str, name: str, anchor: str
+    rows: pl.DataFrame, drift: Mapping[str, Mapping[str, Any]], vehicle_id: str, name: str, anchor: str, most: int
 ) -> Plot:
-    """One parameter of one triad, a row of panels an axis: against time, and against temperature.
+    """One parameter of one triad, a row of panels an axis: against time, and (where logged) against temperature.
 
     `rows` are those of `calibration` of one IMU, sensor, method and parameter, in order of time; `drift` has the
-    regression of an axis where there is one.
+    regression of an axis where there is one, and `most` is how many flights are shown, the latest.
     """
-    axes_names = sorted(rows["axis"].unique().to_list())
-    figure, axes = panels(len(axes_names), 2, height_in=_ROW_IN * len(axes_names) + 0.85, sharex="col")
-    told: set[str] = set()
-    for row, name_of_axis in enumerate(axes_names):
-        own = rows.filter(pl.col("axis") == name_of_axis).tail(MOST_POINTS)
-        told |= _panel_row(axes[row], own, drift.get(name_of_axis), vehicle_id, name_of_axis, unit(own["unit"][0]))
+    names = sorted(rows["axis"].unique().to_list())
+    warm = rows["temperature_degc"].is_not_null().any()
+    figure, axes = panels(len(names), 2 if warm else 1, height_in=_ROW_IN * len(names) + 0.85, sharex="col")
+    told: set[str] = set() if warm else {"cold"}
+    for row, axis_name in zip(axes, names, strict=True):
+        own = rows.filter(pl.col("axis") == axis_name).tail(most)
+        told |= _panel_row(row, own, drift.get(axis_name), vehicle_id)
+        own_unit = unit(own["unit"][0])
+        row[0].set_ylabel(f"{axis_name} ({own_unit})" if own_unit else axis_name)
     headed(axes[0, 0], f"{name} against time")
-    headed(axes[0, 1], f"{name} against temperature")
-    axes[-1, 1].set_xlabel("temperature (°C)")
-    shown = rows.filter(pl.col("axis") == axes_names[0]).height
-    caption = [
-        f"{name}: {count(min(shown, MOST_POINTS), 'flight')}"
-        + (f" of {shown}, the latest" if shown > MOST_POINTS else "")
-    ]
-    caption[0] += ", error bars ±1σ."
-    if "trend" in told:
-        caption.append(
-            f"Line and band: the regression of table drift ±{SIGMAS:.0f}σ; points on the left are reduced to 25 °C, on"
-            " the right to the time of the last flight."
-        )
-    else:
-        caption.append("Values as estimated; table drift has no regression of it.")
-    if "step" in told:
-        caption.append("Dashed vertical line: detected step; paler points lie before it.")
-    if "refused" in told:
-        caption.append("Crosses: refused, not used.")
-    if "outside" in told:
-        caption.append("Triangles: beyond the panel.")
-    if "elsewhere" in told:
-        caption.append("Open circles: the same IMU on another vehicle.")
-    if "undated" in told:
-        caption.append("Flights without a known date are at the left edge.")
-    description = (
-        f"{name}, {count(shown, 'flight')}, axes {', '.join(axes_names)}, against time and against temperature"
-    )
-    return Plot(anchor, svg(figure, anchor, name, description), " ".join(caption))
+    if warm:
+        headed(axes[0, 1], f"{name} against temperature")
+        axes[-1, 1].set_xlabel("temperature (°C)")
+    n = rows.filter(pl.col("axis") == names[0]).height
+    shown = count(n, "flight") if n <= most else f"the latest {most} of {n} flights"
+    sentences = [f"{name}: {shown}, error bars ±1σ.", *(sentence for key, sentence in TOLD.items() if key in told)]
+    description = f"{name}, {shown}, axes {', '.join(names)}, against time{' and temperature' if warm else ''}"
+    return Plot(anchor, svg(figure, anchor, name, description), " ".join(sentences))
 
 
-def _panel_row(
-    axes: Any, rows: pl.DataFrame, trend: Mapping[str, Any] | None, vehicle_id: str, axis_name: str, own_unit: str
-) -> set[str]:
-    told: set[str] = set()
+def _panel_row(axes: Any, rows: pl.DataFrame, trend: Mapping[str, Any] | None, vehicle_id: str) -> set[str]:
+    """One axis; what its caption has to tell."""
+    trend = None if trend is None or trend["value_at_25degc"] is None else trend
+    told = {"plain" if trend is None else "trend"}
     moments: list[datetime | None] = rows["started_at"].to_list()
-    dated = [m for m in moments if m is not None]
     used = (rows["status"] == "ok").to_numpy()
-    reference = max((m for m, ok in zip(moments, used, strict=True) if m is not None and ok), default=None)
-    reference = reference or (max(dated) if dated else datetime(1970, 1, 1))
+    dated = [m for m in moments if m is not None]
+    last = max((m for m, ok in zip(moments, used, strict=True) if m is not None and ok), default=None)
+    reference = last or (max(dated) if dated else datetime(1970, 1, 1))
     days = days_after(moments, reference)
-    degc = rows["temperature_degc"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
-    value = rows["value"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+    degc, value = (rows[c].cast(pl.Float64).fill_null(float("nan")).to_numpy() for c in ("temperature_degc", "value"))
     sd = rows["sd"].cast(pl.Float64).fill_null(0.0).to_numpy()
-    has_trend = trend is not None and trend["value_at_25degc"] is not None
-    at_25, at_last = value, value
-    if has_trend and trend is not None:
-        told.add("trend")
-        at_25 = value - np.nan_to_num((trend["slope_per_degc"] or 0.0) * (degc - 25.0))
-        at_last = value - np.nan_to_num((trend["slope_per_day"] or 0.0) * days)
-    changed = None if trend is None else trend["change_at"]
+    elsewhere = (rows["vehicle_id"] != vehicle_id).to_numpy()
+    at_25, at_last, changed = value, value, None
     before = np.zeros(len(value), dtype=bool)
+    if trend is not None:
+        at_25 = value - np.nan_to_num((trend["slope_per_degc"] or 0.0) * (degc - REFERENCE_DEGC))
+        at_last = value - np.nan_to_num((trend["slope_per_day"] or 0.0) * days)
+        changed = trend["change_at"]
     if changed is not None:
         told.add("step")
         before = days < days_after([changed], reference)[0]
-    elsewhere = (rows["vehicle_id"] != vehicle_id).to_numpy()
-    # days become dates for the axis; flights without one stand before the first
-    first = float(np.nanmin(days)) if dated else 0.0
-    when = np.where(np.isnan(days), first - max(1.0, 0.03 * -first), days)
     if dated and np.isnan(days).any():
         told.add("undated")
-    x_time = np.array([reference + timedelta(days=float(d)) for d in when]) if dated else np.arange(1.0, len(value) + 1)
-    for axis, x, y in ((axes[0], x_time, at_25), (axes[1], degc, at_last)):
-        told |= _points(axis, x, y, sd, used, before, elsewhere, _limits(y[used], sd[used]))
-    if has_trend and trend is not None:
-        start = first if changed is None else float(days_after([changed], reference)[0])
-        line = np.linspace(start, 0.0, 60)
-        _band(axes[0], np.array([reference + timedelta(days=float(d)) for d in line]), predicted(trend, 25.0, line))
-        known = degc[~np.isnan(degc) & used]
-        if known.size:
-            warm = np.linspace(known.min(), known.max(), 60)
-            _band(axes[1], warm, predicted(trend, warm, 0.0))
+    first = float(np.nanmin(days)) if dated else 0.0
+    when = np.where(np.isnan(days), first - max(1.0, -0.03 * first), days)
+    x = _dates_at(when, reference) if dated else np.arange(1.0, len(value) + 1)
+    for axis, across, y in zip(axes, (x, degc), (at_25, at_last), strict=False):
+        told |= _points(axis, across, y, sd, used, before, elsewhere)
+    if trend is not None and dated:
+        line = np.linspace(first if changed is None else days_after([changed], reference)[0], 0.0, 60)
+        _band(axes[0], _dates_at(line, reference), predicted(trend, REFERENCE_DEGC, line))
+    known = degc[~np.isnan(degc) & used]
+    if trend is not None and known.size and len(axes) > 1:
+        warm = np.linspace(known.min(), known.max(), 60)
+        _band(axes[1], warm, predicted(trend, warm, 0.0))
     if changed is not None and dated:
         axes[0].axvline(changed, color=INK["warn"], linewidth=1.0, linestyle=(0, (4, 2)))
-    axes[0].set_ylabel(f"{axis_name} ({own_unit})" if own_unit else axis_name)
     if dated:
         _dates(axes[0])
     else:
         axes[0].set_xlabel("flight")
-    if np.isnan(degc).all():
-        axes[1].text(
-            0.5,
-            0.5,
-            "no temperature in the logs",
-            transform=axes[1].transAxes,
-            ha="center",
-            va="center",
-            color=INK["muted"],
-        )
-        axes[1].set_xticks([])
     return told
+
+
+def _dates_at(days: Array, reference: datetime) -> np.ndarray:
+    """Moments so many days after the reference, for an axis."""
+    return np.array([reference + timedelta(days=float(d)) for d in days])
 
 
 def _limits(value: Array, sd: Array) -> tuple[float, float]:
@@ -148,9 +134,8 @@ def _points(
     used: np.ndarray,
     before: np.ndarray,
     elsewhere: np.ndarray,
-    limits: tuple[float, float],
 ) -> set[str]:
-    low, high = limits
+    low, high = _limits(y[used], sd[used])
     axis.set_ylim(low, high)
     inside = (y >= low) & (y <= high)
     told = set()
@@ -160,16 +145,8 @@ def _points(
         (used & inside & elsewhere, INK["c1"], "o", "none"),
     ):
         if mask.any():
-            axis.errorbar(
-                x[mask],
-                y[mask],
-                yerr=sd[mask],
-                fmt=marker,
-                markersize=3.5,
-                color=colour,
-                markerfacecolor=face,
-                elinewidth=0.7,
-            )
+            _bars(axis, x[mask], y[mask], sd[mask], colour)
+            axis.plot(x[mask], y[mask], marker, markersize=3.5, color=colour, markerfacecolor=face, linestyle="none")
     refused = ~used & np.isfinite(y)
     if (refused & inside).any():
         axis.plot(x[refused & inside], y[refused & inside], "x", color=INK["muted"], markersize=4)
@@ -186,6 +163,13 @@ def _points(
     if (used & elsewhere).any():
         told.add("elsewhere")
     return told
+
+
+def _bars(axis: Any, x: Any, y: Array, sd: Array, colour: str) -> None:
+    """Error bars of (n,) points, as one line with gaps."""
+    across = np.repeat(x, 3)
+    along = np.column_stack([y - sd, y + sd, np.full(len(y), np.nan)]).ravel()
+    axis.plot(across, along, color=colour, linewidth=0.7)
 
 
 def _band(axis: Any, x: Array, line: tuple[Array, Array]) -> None:
@@ -274,15 +258,8 @@ def lag_plot(sync: pl.DataFrame, anchor: str) -> Plot | None:
         (axes[0, 1], "skew_ppm", "skew_sd_ppm", 1.0, "clock rate (ppm)"),
     ):
         y = factor * good[value].to_numpy()
-        axis.errorbar(
-            x,
-            y,
-            yerr=factor * good[sd].fill_null(0.0).to_numpy(),
-            fmt="o",
-            markersize=3.5,
-            color=INK["c1"],
-            elinewidth=0.7,
-        )
+        _bars(axis, x, y, factor * good[sd].fill_null(0.0).to_numpy(), INK["c1"])
+        axis.plot(x, y, "o", markersize=3.5, color=INK["c1"], linestyle="none")
         headed(axis, title)
         if dated:
             _dates(axis)

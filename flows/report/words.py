@@ -40,7 +40,7 @@ def scientific(value: float | None, sd: float | None = None) -> str:
 
 def day(moment: datetime | None) -> str:
     """A date and time of day, UTC."""
-    return "unknown" if moment is None else moment.strftime("%Y-%m-%d %H:%M")
+    return "undated" if moment is None else moment.strftime("%Y-%m-%d %H:%M")
 
 
 def age(moment: datetime | None, as_of: datetime | None) -> str:

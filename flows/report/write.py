@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Collection
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flows.report.links import FLEET, Links, flight_name, vehicle_name
 from flows.report.page import Page, html
 from warehouse.files import write_bytes
 from warehouse.layout import prepare
+
+if TYPE_CHECKING:
+    from flows.calibrate import CalibratedLog
 
 FOLDER = "reports"
 
@@ -90,6 +94,14 @@ def flight_report(root: Path, flight_id: str, path: Path | None = None) -> Path:
     data = read_flight(root, flight_id)
     path = path or _place(root, flight_name(data.flight["flight_id"]))
     return _write(path, flight_page(data, Links(path.parent)))
+
+
+def log_report(log: CalibratedLog, path: Path) -> Path:
+    """The page of a log calibrated in memory, in the file `path`."""
+    from flows.report.flight import flight_page
+    from flows.report.flight_data import of_log
+
+    return _write(path, flight_page(of_log(log), Links(path.parent)))
 
 
 def _place(root: Path, name: str) -> Path:
