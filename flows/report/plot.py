@@ -71,6 +71,10 @@ def panels(rows: int, columns: int, *, height_in: float, **shared: Any) -> tuple
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(_WIDTH_IN, height_in))
         axes = figure.subplots(rows, columns, squeeze=False, **shared)
+    for axis in axes.flat:
+        axis.set_title("", y=1.0)  # matplotlib seeks a place for a title, even an empty one, at some cost
+        axis.yaxis.get_major_locator().set_params(nbins=5)
+        axis.yaxis.get_offset_text().set_x(-0.06 * columns)  # left of the title
     left, right, bottom, top = 0.75, 0.15, 0.5, 0.35
     figure.subplots_adjust(
         left=left / _WIDTH_IN,
