@@ -52,7 +52,7 @@ class NightProgress:
         elif outcome.ran:
             facts = outcome.facts
             why = f" ({facts['reason_code']})" if facts["reason_code"] else ""
-            what = f"{facts['verdict']}{why}, {len(outcome.ran)} stages run"
+            what = f"{facts['verdict']}{why}, {len(outcome.ran)} stages run ({outcome.cause()})"
             say(f"[{self._done}/{self._total}] {outcome.job.log_uri}: {what}")
 
     def __enter__(self) -> Self:
