@@ -165,6 +165,11 @@ def _history(
     names = ("value_at_25degc", "slope_per_degc", "slope_per_day")
     row |= {name: float(v) for name, v in zip(names, estimate, strict=True)}
     row |= {f"{n}_sd" if "slope" in n else "sd": float(v) for n, v in zip(names, deviation, strict=True)}
-    row["last_z"] = last
+    row |= {
+        "last_z": last,
+        "as_of": START + dt.timedelta(days=float(day[-1])),
+        "best_known_degc": float(degc[used].mean()),
+    }
+    row["reason"] = None if fault == "stable" else f"The reason of {fault}."
     row["change_at"] = None if step_at is None else START + dt.timedelta(days=float(day[step_at]))
     return value, row

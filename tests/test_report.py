@@ -332,5 +332,9 @@ def test_band_is_the_regressions_own_standard_deviation() -> None:
     value, sd = predicted(row, 35.0, -1.0)
     assert value == pytest.approx(2.0 + 1.0 + 0.5)
     assert sd == pytest.approx(np.sqrt(0.3**2 + 0.2**2 + 0.4**2))
+    # value and slope independent at 5 °C: as far below it as 25 °C is above, the sd is the same
+    apart = {**row, "slope_per_degc_sd": 0.01, "best_known_degc": 5.0}
+    for degc, variance in ((25.0, 0.3**2), (5.0, 0.3**2 - 0.2**2), (-15.0, 0.3**2)):
+        assert predicted(apart, degc, 0.0)[1] == pytest.approx(np.sqrt(variance))
     value, sd = predicted({**row, "slope_per_day": None, "slope_per_day_sd": None}, 25.0, 9.0)
     assert (float(value), float(sd)) == (2.0, 0.3)

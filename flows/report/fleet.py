@@ -25,7 +25,7 @@ POINTS = 60
 
 _COLUMNS = (
     Column("vehicle"),
-    Column("IMU"),
+    Column("IMU", "id"),
     Column("status"),
     Column("latest verdict"),
     Column("last usable flight", "nowrap"),
@@ -69,7 +69,7 @@ def fleet_page(root: Path, links: Links, as_of: datetime | None) -> Page:
             for verdict in ("ok", "partial", "quarantined", "rejected")
             if verdict in verdicts
         ),
-        *((f"vehicles {status}", str(n)) for status, n in statuses.items() if n),
+        *((f"vehicles: {status}", str(n)) for status, n in statuses.items() if n),
     ]
     overview: list[Part] = [
         Table("A row per vehicle. Status is the worst of its IMU's parameters in the table drift.", _COLUMNS, rows),
@@ -212,12 +212,24 @@ def _siblings(drift: pl.DataFrame, row: Mapping[str, Any]) -> list[float]:
     return others["value_at_25degc"].to_list()
 
 
+def _unsteady(drift: pl.DataFrame) -> list[dict[str, Any]]:
+    """Rows that need a look. `bias` and `zero` follow from `zero_bias`: where that says the same they are left out."""
+    found = [row for row in drift.iter_rows(named=True) if row["status"] not in ("stable", "insufficient")]
+    place = ("imu_id", "sensor", "method", "axis", "status")
+    told = {tuple(row[name] for name in place) for row in found if row["parameter"] == "zero_bias"}
+    return [
+        row
+        for row in found
+        if row["parameter"] not in ("bias", "zero") or tuple(row[name] for name in place) not in told
+    ]
+
+
 def _looks(drift: pl.DataFrame, links: Links) -> list[Part]:
     if drift.is_empty():
         return [Notice("The table drift is empty: no trends have been computed yet. Status columns say so.")]
     order = {status: i for i, status in enumerate(STATUSES)}
     found = sorted(
-        (row for row in drift.iter_rows(named=True) if row["status"] not in ("stable", "insufficient")),
+        _unsteady(drift),
         key=lambda row: (
             order.get(row["status"], 9),
             row["vehicle_id"],
@@ -233,7 +245,7 @@ def _looks(drift: pl.DataFrame, links: Links) -> list[Part]:
     if found:
         columns = (
             Column("vehicle"),
-            Column("IMU"),
+            Column("IMU", "id"),
             Column("parameter"),
             Column("status"),
             Column("what", "wide"),
@@ -243,7 +255,7 @@ def _looks(drift: pl.DataFrame, links: Links) -> list[Part]:
             [
                 links.to(vehicle_name(row["vehicle_id"]), row["vehicle_id"]),
                 row["imu_id"],
-                f"{row['sensor']} {row['parameter']} {row['axis']} ({plain_name(row['method'])})",
+                f"{plain_name(row['sensor'])} {row['parameter']} {row['axis']} ({plain_name(row['method'])})",
                 badge(row["status"]),
                 change_sentence(row, _siblings(drift, row)),
                 number(row["last_z"], 2),
@@ -251,7 +263,10 @@ def _looks(drift: pl.DataFrame, links: Links) -> list[Part]:
             for row in found[:LOOKS]
         ]
         more = f"{len(found) - LOOKS} more: fieldcal drift." if len(found) > LOOKS else ""
-        parts.append(Table("Parameters that are not steady, worst first", columns, rows, more))
+        caption = (
+            "Parameters that are not steady, worst first (bias and zero are left out where zero_bias says the same)"
+        )
+        parts.append(Table(caption, columns, rows, more))
     else:
         parts.append(Text("No parameter with enough flights drifts, stepped, or stands out from its siblings."))
     if few:

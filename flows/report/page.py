@@ -49,7 +49,7 @@ class Heading:
 
 @dataclass(frozen=True)
 class Column:
-    """A table's column: its name, and "n" (numbers, to the right), "wide", "nowrap" or nothing."""
+    """A table's column: its name, and "n" (numbers, to the right), "id", "wide", "nowrap" or nothing."""
 
     name: str
     kind: str = ""

@@ -176,6 +176,14 @@ def legend(axis: Any, columns: int = 4, *, inside: str | None = None) -> None:
     )
 
 
+def legend_below(figure: Figure, axis: Axes) -> None:
+    """Name the curves of an axis for all panels, below them."""
+    handles, labels = axis.get_legend_handles_labels()
+    place: Any = {"loc": "lower center", "bbox_to_anchor": (0.5, 0.0), "ncols": len(labels)}
+    figure.legend(handles, labels, fontsize=8, frameon=False, labelcolor=INK["fg"], borderpad=0.1, **place)
+    figure.subplots_adjust(bottom=0.85 / figure.get_figheight())
+
+
 def curve(
     axis: Axes, t: Array, x: Array, colour: str, *, label: str | None = None, width: float = 1.0, dashes: str = "-"
 ) -> None:

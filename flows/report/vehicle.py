@@ -14,7 +14,7 @@ from flows.ask import existing
 from flows.report.history import as_of_sentence, newest, reason_of, unfold, usable_flights
 from flows.report.links import Links, flight_name
 from flows.report.page import Column, Folded, Heading, Notice, Page, Part, Section, Simple, Table, Text, badge
-from flows.report.trend import STATUSES, fly_with_sentence, worst_status
+from flows.report.trend import STATUSES, change_sentence, fly_with_sentence, worst_status
 from flows.report.vehicle_figures import MOST_POINTS, agreement_plot, lag_plot, parameter_plot
 from flows.report.words import PARAMETERS, SENSORS, age, count, day, plain_name, preferred, scientific, unit
 from flows.show import number
@@ -116,7 +116,7 @@ def _sources(by_axis: Mapping[str, Mapping[str, Any]]) -> str:
 
 def _why(row: Mapping[str, Any]) -> str:
     own = row.get("why") or row.get("reason")
-    return f"{fly_with_sentence(row)}. {own}" if own else fly_with_sentence(row)
+    return f"{fly_with_sentence(row)}: {own}" if own else fly_with_sentence(row)
 
 
 def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
@@ -128,9 +128,9 @@ def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
         ]
     parts: list[Part] = []
     if set(drift["status"].to_list()) == {"insufficient"}:
-        parts.append(
-            Notice(f"Too few flights for a trend ({count(usable, 'usable flight')}): every status is insufficient.")
-        )
+        told = f"Too few flights for a trend ({count(usable, 'usable flight')}): every status is insufficient."
+        why = {str(r["reason"]) for r in drift.iter_rows(named=True) if r.get("reason")}
+        parts.append(Notice(" ".join([told, *sorted(why)])))
     ordered = sorted(
         drift.iter_rows(named=True),
         key=lambda r: (
@@ -145,18 +145,31 @@ def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
     moving.sort(key=lambda r: _place(STATUSES, r["status"]))
     counts = [f"{n} {status}" for status in STATUSES if (n := drift.filter(pl.col("status") == status).height)]
     if moving:
-        parts.append(_trend_table("Parameters that are not steady, worst first", moving))
+        columns = (
+            Column("parameter"),
+            Column("axis"),
+            Column("status"),
+            Column("why", "wide"),
+            Column("last flight, σ", "n"),
+        )
+        lines = [
+            [_name(r), r["axis"], badge(r["status"]), change_sentence(r, []), number(r["last_z"], 2)] for r in moving
+        ]
+        parts.append(Table("Parameters that are not steady, worst first", columns, lines))
     elif not parts:
         parts.append(Text("Every parameter with enough flights is steady."))
     every = _trend_table("Regression over temperature and time", ordered)
     return [*parts, Folded(f"All {len(ordered)} regressions: {', '.join(counts)}", [every])]
 
 
+def _name(row: Mapping[str, Any]) -> str:
+    return f"{plain_name(row['sensor'])} {row['parameter']} ({plain_name(row['method'])})"
+
+
 def _trend_table(caption: str, rows: list[dict[str, Any]]) -> Table:
     columns = (
         Column("parameter"),
         Column("axis"),
-        Column("method"),
         Column("status"),
         Column("flights", "n"),
         Column("at 25 °C", "n"),
@@ -168,9 +181,8 @@ def _trend_table(caption: str, rows: list[dict[str, Any]]) -> Table:
     )
     lines = [
         [
-            f"{r['sensor']} {r['parameter']}",
+            _name(r),
             r["axis"],
-            plain_name(r["method"]),
             badge(r["status"]),
             str(r["n_flights"]),
             scientific(r["value_at_25degc"], r["sd"]),

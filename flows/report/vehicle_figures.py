@@ -11,8 +11,8 @@ import polars as pl
 
 from fieldcal.rotation import Array
 from flows.report.page import Plot
-from flows.report.plot import INK, XYZ, headed, legend, panels, svg
-from flows.report.trend import REFERENCE_DEGC, days_after, predicted
+from flows.report.plot import INK, XYZ, headed, legend_below, panels, svg
+from flows.report.trend import REFERENCE_DEGC, days_after, predicted, reference_moment
 from flows.report.words import count, day, unit
 
 MOST_POINTS = 250
@@ -73,7 +73,8 @@ def _panel_row(axes: Any, rows: pl.DataFrame, trend: Mapping[str, Any] | None, v
     used = (rows["status"] == "ok").to_numpy()
     dated = [m for m in moments if m is not None]
     last = max((m for m, ok in zip(moments, used, strict=True) if m is not None and ok), default=None)
-    reference = last or (max(dated) if dated else datetime(1970, 1, 1))
+    stated = None if trend is None else reference_moment(trend)
+    reference = stated or last or (max(dated) if dated else datetime(1970, 1, 1))
     days = days_after(moments, reference)
     degc, value = (rows[c].cast(pl.Float64).fill_null(float("nan")).to_numpy() for c in ("temperature_degc", "value"))
     sd = rows["sd"].cast(pl.Float64).fill_null(0.0).to_numpy()
@@ -217,7 +218,7 @@ def agreement_plot(fit: pl.DataFrame, anchor: str) -> Plot | None:
             curves.append((own.tail(MOST_POINTS), label))
     if not curves:
         return None
-    figure, axes = panels(1, 2, height_in=3.1)
+    figure, axes = panels(1, 2, height_in=3.2)
     for number, (own, label) in enumerate(curves):
         x, dated = _x_of(own["started_at"].to_list())
         colour = (*XYZ, INK["c4"])[number]
@@ -232,9 +233,9 @@ def agreement_plot(fit: pl.DataFrame, anchor: str) -> Plot | None:
                 axis.set_xlabel("flight")
     headed(axes[0, 0], "TIC (Eq. 16)")
     headed(axes[0, 1], "rms attitude error (°)")
-    for axis in axes[0]:
-        axis.set_ylim(bottom=0)
-    legend(axes[0, 1], 2)
+    axes[0, 0].set_yscale("log")
+    axes[0, 1].set_ylim(bottom=0)
+    legend_below(figure, axes[0, 0])
     title = "Agreement over the flights"
     caption = (
         "Theil's coefficient flatters unit quaternions (TIC ≈ α/4 for an rms error α in rad), so degrees stand beside."

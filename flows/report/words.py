@@ -63,7 +63,7 @@ def count(n: int, what: str) -> str:
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 
-NAMES = {"vps": "VPS", "quest": "QUEST", "svd": "SVD", "triad": "TRIAD"}
+NAMES = {"vps": "VPS", "fit": "agreement", "quest": "QUEST", "svd": "SVD", "triad": "TRIAD"}
 
 
 def plain_name(name: str) -> str:
