@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -36,7 +39,7 @@ from flows.steps import FlightWork
 from warehouse.publish import publish
 from warehouse.stage_store import StageStore
 
-HOSTILE = '<script>alert("x")</script>&\'"><img src=x onerror=alert(1)>'
+HOSTILE = '<script>alert("x")</script>&\'"><img src=x onerror=alert(1)>$^{$'
 LARGEST_BYTES = 3_000_000
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 
@@ -176,6 +179,18 @@ def test_vehicle_shows_refused_values_and_why(fleet: Path) -> None:
     page = sound(write_vehicle_report(fleet, "stable-1"))
     assert "Crosses: refused, not used." in page.text
     assert "the residual is 4.1 % of the field: a magnet came near." in page.text
+
+
+def test_pages_do_not_depend_on_the_session(fleet: Path, tmp_path: Path) -> None:
+    """Hash seed, time zone and the user's own matplotlib settings change no byte."""
+    (tmp_path / "matplotlibrc").write_text(
+        "lines.linewidth: 7\nfont.size: 30\ntimezone: Asia/Tokyo\n", encoding="utf-8"
+    )
+    command = [sys.executable, "-m", "flows.cli", "report", "--warehouse", str(fleet), "--vehicle", "step-1", "-o"]
+    for name, changes in (("a", {"PYTHONHASHSEED": "1"}), ("b", {"PYTHONHASHSEED": "2", "TZ": "Asia/Tokyo"})):
+        own = {"MATPLOTLIBRC": str(tmp_path)} if name == "b" else {}
+        subprocess.run([*command, str(tmp_path / f"{name}.html")], check=True, env={**os.environ, **changes, **own})
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
 
 
 def test_hostile_names_are_text(fleet: Path) -> None:

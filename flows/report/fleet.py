@@ -48,13 +48,13 @@ def fleet_page(root: Path, links: Links, as_of: datetime | None) -> Page:
     last = {row["vehicle_id"]: row for row in usable.iter_rows(named=True)}
     worst = _worst_tics(warehouse, last)
     sparks = _sparks(warehouse, drift)
-    own_drift = {key[0]: part for key, part in drift.partition_by("vehicle_id", as_dict=True).items()}
+    trends = {key[0]: part for key, part in drift.partition_by("imu_id", as_dict=True).items()}
     rows, statuses = [], dict.fromkeys((*STATUSES, NOT_ANALYSED), 0)
     for key, part in (
         flights.sort("vehicle_id", "started_at", "flight_id").partition_by("vehicle_id", as_dict=True).items()
     ):
         vehicle = str(key[0])
-        status = worst_status(own_drift.get(vehicle))
+        status = worst_status(trends.get(part["imu_id"][-1]))
         statuses[status or NOT_ANALYSED] += 1
         rows.append(
             _row(vehicle, part, status, last.get(vehicle), worst.get(vehicle), sparks.get(vehicle), links, moment)

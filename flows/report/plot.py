@@ -8,7 +8,8 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -63,14 +64,23 @@ _STYLE: Any = {
 }
 
 
-def panels(rows: int, columns: int, *, height_in: float, **shared: Any) -> tuple[Figure, Any]:
-    """A figure of the page's width with (rows, columns) panels in the page's style."""
+@contextmanager
+def page_style() -> Iterator[None]:
+    """All drawing of a page happens inside: its style, and nothing of the user's own settings."""
     import matplotlib as mpl
+
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(_STYLE)
+        yield
+
+
+def panels(rows: int, columns: int, *, height_in: float, **shared: Any) -> tuple[Figure, Any]:
+    """A figure of the page's width with (rows, columns) panels."""
     from matplotlib.figure import Figure
 
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(_WIDTH_IN, height_in))
-        axes = figure.subplots(rows, columns, squeeze=False, **shared)
+    figure = Figure(figsize=(_WIDTH_IN, height_in))
+    axes = figure.subplots(rows, columns, squeeze=False, **shared)
     for axis in axes.flat:
         axis.set_title("", y=1.0)  # matplotlib seeks a place for a title, even an empty one, at some cost
         axis.yaxis.get_major_locator().set_params(nbins=5)
@@ -89,16 +99,14 @@ def panels(rows: int, columns: int, *, height_in: float, **shared: Any) -> tuple
 
 def solid_panels(columns: int, *, height_in: float) -> tuple[Figure, list[Any]]:
     """A figure of the page's width with three-dimensional panels."""
-    import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(_WIDTH_IN, height_in))
-        axes = [figure.add_subplot(1, columns, i + 1, projection="3d") for i in range(columns)]
-        for axis in axes:
-            for own in (axis.xaxis, axis.yaxis, axis.zaxis):
-                own.set_pane_color((0, 0, 0, 0))
-                own._axinfo["grid"].update(color=INK["line"], linewidth=0.5)
+    figure = Figure(figsize=(_WIDTH_IN, height_in))
+    axes: list[Any] = [figure.add_subplot(1, columns, i + 1, projection="3d") for i in range(columns)]
+    for axis in axes:
+        for own in (axis.xaxis, axis.yaxis, axis.zaxis):
+            own.set_pane_color((0, 0, 0, 0))
+            own._axinfo["grid"].update(color=INK["line"], linewidth=0.5)
     figure.subplots_adjust(left=0.02, right=0.95, bottom=0.06, top=0.92, wspace=0.12)
     return figure, axes
 
@@ -106,13 +114,14 @@ def solid_panels(columns: int, *, height_in: float) -> tuple[Figure, list[Any]]:
 def svg(figure: Figure, name: str, title: str, description: str) -> Markup:
     """The figure as inline SVG, an image to assistive technology, with `title` and `description` as its text.
 
-    `name` tells its inner ids from those of the page's other figures.
+    `name` is the salt of its inner ids: the same at every run, others than those of the page's
+    other figures.
     """
     import matplotlib as mpl
 
     out = io.StringIO()
-    with mpl.rc_context({**_STYLE, "svg.hashsalt": name}):
-        figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
+    mpl.rcParams["svg.hashsalt"] = name
+    figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
     return Markup(_themed(out.getvalue(), name, title, description))
 
 
@@ -157,7 +166,7 @@ def _short(number: re.Match[str]) -> str:
 
 def headed(axis: Axes, text: str) -> None:
     """Name a panel, above its left corner."""
-    axis.set_title(text, loc="left", fontsize=9, color=INK["fg"])
+    axis.set_title(text, loc="left", fontsize=9, color=INK["fg"], parse_math=False)
 
 
 def legend(axis: Any, columns: int = 4, *, inside: str | None = None) -> None:

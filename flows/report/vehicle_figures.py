@@ -53,7 +53,7 @@ def parameter_plot(
         own = rows.filter(pl.col("axis") == axis_name).tail(most)
         told |= _panel_row(row, own, drift.get(axis_name), vehicle_id)
         own_unit = unit(own["unit"][0])
-        row[0].set_ylabel(f"{axis_name} ({own_unit})" if own_unit else axis_name)
+        row[0].set_ylabel(f"{axis_name} ({own_unit})" if own_unit else axis_name, parse_math=False)
     headed(axes[0, 0], f"{name} against time")
     if warm:
         headed(axes[0, 1], f"{name} against temperature")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import UTC, datetime
 
 from flows.show import number, with_sd
 
@@ -39,8 +39,8 @@ def scientific(value: float | None, sd: float | None = None) -> str:
 
 
 def day(moment: datetime | None) -> str:
-    """A date and time of day, UTC."""
-    return "undated" if moment is None else moment.strftime("%Y-%m-%d %H:%M")
+    """A date and time of day, UTC (SQL answers come in the session's time zone)."""
+    return "undated" if moment is None else moment.astimezone(UTC).strftime("%Y-%m-%d %H:%M")
 
 
 def age(moment: datetime | None, as_of: datetime | None) -> str:

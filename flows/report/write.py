@@ -14,6 +14,7 @@ from warehouse.layout import prepare
 
 if TYPE_CHECKING:
     from flows.calibrate import CalibratedLog
+    from flows.report.flight_data import FlightData
 
 FOLDER = "reports"
 
@@ -80,28 +81,37 @@ def vehicle_report(
     expected: frozenset[str] = frozenset(),
 ) -> Path:
     """A vehicle's page in the file `path` (default below ROOT/reports)."""
+    from flows.report.plot import page_style
     from flows.report.vehicle import vehicle_page
 
     path = path or _place(root, vehicle_name(vehicle_id))
-    return _write(path, vehicle_page(root, vehicle_id, Links(path.parent, expected), as_of))
+    with page_style():
+        page = vehicle_page(root, vehicle_id, Links(path.parent, expected), as_of)
+    return _write(path, page)
 
 
 def flight_report(root: Path, flight_id: str, path: Path | None = None) -> Path:
     """A flight's page in the file `path` (default below ROOT/reports)."""
-    from flows.report.flight import flight_page
     from flows.report.flight_data import read_flight
 
     data = read_flight(root, flight_id)
-    path = path or _place(root, flight_name(data.flight["flight_id"]))
-    return _write(path, flight_page(data, Links(path.parent)))
+    return _flight(data, path or _place(root, flight_name(data.flight["flight_id"])))
 
 
 def log_report(log: CalibratedLog, path: Path) -> Path:
     """The page of a log calibrated in memory, in the file `path`."""
-    from flows.report.flight import flight_page
     from flows.report.flight_data import of_log
 
-    return _write(path, flight_page(of_log(log), Links(path.parent)))
+    return _flight(of_log(log), path)
+
+
+def _flight(data: FlightData, path: Path) -> Path:
+    from flows.report.flight import flight_page
+    from flows.report.plot import page_style
+
+    with page_style():
+        page = flight_page(data, Links(path.parent))
+    return _write(path, page)
 
 
 def _place(root: Path, name: str) -> Path:
