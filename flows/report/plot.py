@@ -34,6 +34,7 @@ BUCKETS = 500
 _WIDTH_IN = 9.6
 _STYLE: Any = {
     "svg.fonttype": "none",
+    "timezone": "UTC",
     "font.size": 9,
     "axes.edgecolor": INK["muted"],
     "axes.labelcolor": INK["fg"],
