@@ -13,7 +13,7 @@ from fieldcal.rotation import Array, continuous, euler_angles
 from flows.report.flight_curves import Curves, covered_cells, lengths
 from flows.report.page import Plot
 from flows.report.plot import INK, XYZ, backdrop, curve, headed, legend, panels, solid_panels, svg, without_wraps
-from flows.report.words import unit
+from flows.report.words import plain_name, unit
 
 SPHERE_POINTS = 1500
 QUEST_HZ = 9.0
@@ -21,7 +21,6 @@ QUEST_HZ = 9.0
 
 QUATERNION_NAMES = ("ε₁", "ε₂", "ε₃", "δ")
 RATE_NAMES = ("ε̇₁", "ε̇₂", "ε̇₃", "δ̇")
-METHOD_NAMES = {"equation_error": "equation error", "output_error": "output error", "joint": "joint"}
 
 
 def unprocessed(tables: Mapping[str, pl.DataFrame], units: Mapping[str, str]) -> Plot | None:
@@ -206,7 +205,7 @@ def body_rates(c: Curves, told: str) -> Plot | None:
             backdrop(axis, c.t_vps, c.vps_rate[:, i], "VPS")
         for (method, rate), colour in zip(c.body_rate.items(), (INK["c3"], INK["c2"], INK["c4"]), strict=False):
             dashes = "-" if method != "output_error" else "--"
-            curve(axis, c.t, rate[:, i], colour, label=METHOD_NAMES[method], width=0.9, dashes=dashes)
+            curve(axis, c.t, rate[:, i], colour, label=plain_name(method), width=0.9, dashes=dashes)
         axis.set_ylabel(f"ω{'xyz'[i]} (rad/s)")
     legend(axes[0, 0])
     axes[2, 0].set_xlabel("time (s)")

@@ -13,6 +13,7 @@ from fieldcal.rotation import Array
 from flows.report.flight_curves import Curves, amplitude_spectrum, lengths
 from flows.report.page import Plot
 from flows.report.plot import INK, curve, headed, legend, panels, svg
+from flows.report.words import plain_name
 
 
 def spectra(c: Curves, samples: pl.DataFrame, calibration: pl.DataFrame, settings: Mapping[str, Any]) -> Plot | None:
@@ -48,7 +49,7 @@ def spectra(c: Curves, samples: pl.DataFrame, calibration: pl.DataFrame, setting
         for method, rate in c.body_rate.items():
             own = np.column_stack([np.interp(t, c.t, column) for column in rate.T])
             spectrum = amplitude_spectrum(t, own - c.vps_rate[c.near], np.zeros(len(t)))
-            rates.append((method.replace("_", " "), spectrum))
+            rates.append((plain_name(method), spectrum))
     wanted.append(("body rate, gyroscope less VPS", "rad/s/√Hz", rates))
     shown = [(title, per, [(n, s) for n, s in lines if s is not None]) for title, per, lines in wanted]
     shown = [entry for entry in shown if entry[2]]
