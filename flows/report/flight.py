@@ -93,7 +93,7 @@ def _refusals(data: FlightData) -> list[Part]:
         parts.append(Text(f"Not run for want of their input: {', '.join(follow)}."))
     noted: dict[str, list[str]] = {}
     for row in data.run:
-        if row["status"] == "ok" and row["reason_code"]:
+        if row["status"] == "ok" and row["reason_code"] and row["measured"].get("reason") != flight["reason"]:
             noted.setdefault(str(row["measured"].get("reason") or row["reason_code"]), []).append(row["stage"])
     parts += [Text(f"{', '.join(stages)}: {reason}") for reason, stages in noted.items()]
     return parts or [Text("Nothing was refused, and the log was read whole.")]

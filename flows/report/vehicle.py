@@ -292,7 +292,7 @@ def _flights(flights: pl.DataFrame, usable: pl.DataFrame, links: Links) -> Table
         if flights.height > FLIGHTS
         else ""
     )
-    return Table("Flights, the latest first", columns, lines, more)
+    return Table("Flights, the latest first (fieldcal report --flight ID writes a flight's page)", columns, lines, more)
 
 
 def _refusals(warehouse: Warehouse, vehicle_id: str, links: Links) -> list[Part]:
