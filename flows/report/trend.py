@@ -73,5 +73,5 @@ def fly_with_sentence(row: Mapping[str, Any]) -> str:
     """Where a constant to fly with comes from."""
     if row["source"] == "flight":
         at = row["temperature_degc"]
-        return f"flight of {day(row['started_at'])}" + ("" if at is None else f", {at:.0f} °C")
-    return "history" if row["source"] == "drift" else str(row["source"])
+        return f"Flight of {day(row['started_at'])}" + ("." if at is None else f", {at:.0f} °C.")
+    return f"History as of {day(row['started_at'])}." if row["source"] == "drift" else f"{row['source']}."

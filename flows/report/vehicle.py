@@ -115,8 +115,7 @@ def _sources(by_axis: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def _why(row: Mapping[str, Any]) -> str:
-    own = row.get("why") or row.get("reason")
-    return f"{fly_with_sentence(row)}: {own}" if own else fly_with_sentence(row)
+    return " ".join(part for part in (fly_with_sentence(row), row.get("why")) if part)
 
 
 def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
