@@ -82,18 +82,22 @@ def panels(rows: int, columns: int, *, height_in: float, **shared: Any) -> tuple
 
     figure = Figure(figsize=(_WIDTH_IN, height_in))
     axes = figure.subplots(rows, columns, squeeze=False, **shared)
+    left, right, bottom, top, between = 0.75, 0.15, 0.5, 0.35, 0.32
+    panel_in = (height_in - bottom - top) / (rows + between * (rows - 1))
     for axis in axes.flat:
-        axis.set_title("", y=1.0)  # matplotlib seeks a place for a title, even an empty one, at some cost
+        # Places of titles and labels are told: matplotlib spends long seeking them, and told ones are in line.
+        axis.set_title("", y=1.0)
+        axis.xaxis.set_label_coords(0.5, -0.32 / panel_in)
+        axis.yaxis.set_label_coords(-0.07 * columns, 0.5)
         axis.yaxis.get_major_locator().set_params(nbins=5)
         axis.yaxis.get_offset_text().set_x(-0.06 * columns)  # left of the title
-    left, right, bottom, top = 0.75, 0.15, 0.5, 0.35
     figure.subplots_adjust(
         left=left / _WIDTH_IN,
         right=1 - right / _WIDTH_IN,
         bottom=bottom / height_in,
         top=1 - top / height_in,
         wspace=0.22,
-        hspace=0.32,
+        hspace=between,
     )
     return figure, axes
 

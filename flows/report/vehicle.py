@@ -111,7 +111,7 @@ def _sources(by_axis: Mapping[str, Mapping[str, Any]]) -> str:
         axes.setdefault(_why(by_axis[axis]), []).append(axis)
     if len(axes) == 1:
         return next(iter(axes))
-    return "; ".join(f"{', '.join(names)}: {source}" for source, names in axes.items())
+    return " ".join(f"{', '.join(names)}: {source}" for source, names in axes.items())
 
 
 def _why(row: Mapping[str, Any]) -> str:

@@ -200,7 +200,8 @@ def _x_of(moments: list[datetime | None]) -> tuple[Any, bool]:
 COMPARED = (
     ("attitude", "", "vps", "attitude against VPS"),
     ("quaternion_rate", "equation_error", "", "quaternion rate, equation error"),
-    ("attitude_propagated", "output_error", "", "propagated attitude, output error"),
+    ("attitude_propagated", "output_error", "", "propagated attitude against QUEST"),
+    ("attitude_propagated", "output_error", "vps", "the same against VPS"),
     ("body_rate", "output_error", "vps", "body rate against VPS, output error"),
 )
 
@@ -221,8 +222,8 @@ def agreement_plot(fit: pl.DataFrame, anchor: str) -> Plot | None:
     figure, axes = panels(1, 2, height_in=3.2)
     for number, (own, label) in enumerate(curves):
         x, dated = _x_of(own["started_at"].to_list())
-        colour = (*XYZ, INK["c4"])[number]
-        style = {"color": colour, "marker": "osD^"[number], "markersize": 3.5, "linewidth": 0.9, "label": label}
+        colour = (*XYZ, INK["c4"], INK["fg"])[number]
+        style = {"color": colour, "marker": "osD^v"[number], "markersize": 3.5, "linewidth": 0.9, "label": label}
         axes[0, 0].plot(x, own["tic"].to_numpy(), **style)
         if own["rms_unit"][0] == "deg":
             axes[0, 1].plot(x, own["rms"].to_numpy(), **style)
