@@ -13,6 +13,8 @@ from cyclopts import App, CycloptsError, Parameter
 import fieldcal
 from flows.cli_drift import drift
 from flows.cli_fly import apply, export
+from flows.cli_report import report as report_command
+from flows.cli_serve import serve, trigger
 from flows.cli_simulate import simulate
 from flows.interrupt import interruptible
 
@@ -36,6 +38,11 @@ AsJson = Annotated[bool, Parameter(name="--json", help="One JSON document on std
 AsCsv = Annotated[bool, Parameter(name="--csv", help="CSV on stdout.")]
 DryRun = Annotated[bool, Parameter(help="List what would run; change nothing.")]
 Workers = Annotated[int, Parameter(help="Processes that calibrate; results do not depend on it.")]
+Runner = Annotated[
+    Literal["process", "dask", "pool"],
+    Parameter(help="Where they run: on this machine, on a Dask cluster, or in the work pool of prefect.yaml."),
+]
+Scheduler = Annotated[str | None, Parameter(help="Address of the Dask scheduler; else a cluster on this machine.")]
 
 
 @app.command
@@ -61,6 +68,7 @@ def calibrate(
     method: Annotated[Literal["serial"], Parameter(show_choices=True)] = "serial",
     profile: Literal["full", "onboard", "paper"] | None = None,
     set_: Annotated[list[str] | None, Parameter(name="--set")] = None,
+    report: Annotated[Path | None, Parameter(help="Write the flight's report to this HTML file too.")] = None,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -80,10 +88,15 @@ def calibrate(
     set_
         Overrule a stage parameter: --set smoothing_cutoff_hz=6.
     """
-    from flows.calibrate import calibrate_log
-    from flows.show import console, print_json
+    from flows.calibrate import run_log
+    from flows.show import console, print_json, say
 
-    document = calibrate_log(log, config, vehicle_id=vehicle, profile=profile, changes=_assignments(set_ or []))
+    result = run_log(log, config, vehicle_id=vehicle, profile=profile, changes=_assignments(set_ or []))
+    document = result.document
+    if report is not None:
+        from flows.report import log_report
+
+        say(f"Report: {log_report(result, report)}")
     if as_json:
         print_json(document)
     else:
@@ -99,6 +112,8 @@ def nightly(
     /,
     *,
     workers: Workers = 1,
+    runner: Runner = "process",
+    scheduler: Scheduler = None,
     dry_run: DryRun = False,
     as_json: AsJson = False,
     warehouse: Root = None,
@@ -112,7 +127,8 @@ def nightly(
         Folder of logs: ARCHIVE/<vehicle>/<session>/<log>.
     """
     _need_folder(archive, "no_archive", "archive")
-    return _night(archive.absolute(), None, workers, dry_run, as_json, warehouse, config)
+    where = {"runner": runner, "scheduler": scheduler}
+    return _night(archive.absolute(), None, workers, where, dry_run, as_json, warehouse, config)
 
 
 @app.command
@@ -121,6 +137,8 @@ def session(
     /,
     *,
     workers: Workers = 1,
+    runner: Runner = "process",
+    scheduler: Scheduler = None,
     dry_run: DryRun = False,
     as_json: AsJson = False,
     warehouse: Root = None,
@@ -135,7 +153,8 @@ def session(
     """
     _need_folder(folder, "no_session", "session folder")
     own = folder.absolute()
-    return _night(own.parent.parent, own, workers, dry_run, as_json, warehouse, config)
+    where = {"runner": runner, "scheduler": scheduler}
+    return _night(own.parent.parent, own, workers, where, dry_run, as_json, warehouse, config)
 
 
 @app.command
@@ -268,6 +287,7 @@ def _night(
     archive: Path,
     folder: Path | None,
     workers: int,
+    where: dict[str, str | None],
     dry: bool,
     as_json: bool,
     warehouse: Path | None,
@@ -292,7 +312,7 @@ def _night(
     from flows.present_night import NightProgress, print_night
 
     with NightProgress() as progress:
-        result = run_night(archive, root, config, folder, workers, progress)
+        result = run_night(archive, root, config, folder, workers, progress, **where)
     if as_json:
         print_json(result)
     else:
@@ -326,6 +346,9 @@ def _assignments(texts: list[str]) -> dict[str, str]:
     return {name.strip(): value.strip() for name, _, value in pairs}
 
 
+app.command(report_command, name="report")
+app.command(serve)
+app.command(trigger)
 app.command(simulate)
 app.command(drift)
 app.command(export)

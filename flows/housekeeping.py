@@ -12,6 +12,7 @@ from flows.alive import dead
 
 if TYPE_CHECKING:
     from prefect.client.orchestration import SyncPrefectClient
+    from prefect.client.schemas.filters import FlowRunFilter
 
 KEPT_DAYS = 30
 AT_ONCE = 200
@@ -70,9 +71,12 @@ def _end(client: SyncPrefectClient, mark: Path) -> None:
 
 
 def _remove_old(client: SyncPrefectClient) -> None:
+    for run in client.read_flow_runs(flow_run_filter=_ended_before(KEPT_DAYS), limit=AT_ONCE):
+        client.delete_flow_run(run.id)
+
+
+def _ended_before(days: float) -> FlowRunFilter:
     from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterEndTime
 
-    before = datetime.now(UTC) - timedelta(days=KEPT_DAYS)
-    ended = FlowRunFilter(end_time=FlowRunFilterEndTime.model_validate({"before_": before}))
-    for run in client.read_flow_runs(flow_run_filter=ended, limit=AT_ONCE):
-        client.delete_flow_run(run.id)
+    before = datetime.now(UTC) - timedelta(days=days)
+    return FlowRunFilter(end_time=FlowRunFilterEndTime.model_validate({"before_": before}))

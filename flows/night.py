@@ -56,7 +56,7 @@ def dry_run(archive: Path, root: Path, config: Path | None, session: Path | None
         {
             "log_uri": job.log_uri,
             "flight_id": job.flight_id,
-            "would_run": plan.missing.get(job.flight_id, []),
+            "would_run": plan.missing.get(job.flight_id, {}),
             "copy_of": plan.copies.get(job.log_uri),
         }
         for job in sorted([*plan.jobs, *plan.copied], key=lambda job: job.log_uri)

@@ -19,18 +19,20 @@ import polars as pl
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import State, StateDetails
-from prefect.futures import as_completed
 from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.states import Completed
 
 from fieldcal.configuration import Configuration
 from flows.alive import alive
+from flows.artifact import keep_artifact
 from flows.flights import flights, lost, one_step
 from flows.history import publish_vehicle, withdraw
 from flows.jobs import Source, configuration_of, find_source
+from flows.log_ledger import write_ledger
 from flows.outcome import Outcome, summary
 from flows.plan import Plan, make_plan
-from flows.runners import Parallel, batches, task_runner
+from flows.pool import hand_over
+from flows.runners import Parallel, answers, batches
 from flows.show import say
 from flows.steps import FlightWork, Record, code_digest
 from flows.watching import Watcher, tell_done, tell_plan, watch
@@ -38,8 +40,6 @@ from warehouse import Warehouse
 from warehouse.errors import WarehouseError
 from warehouse.files import remove_abandoned
 from warehouse.layout import prepare
-
-Batch = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,13 @@ def run_step(flight_id: str, step: str, log_uri: str) -> State[Any]:
 def run_batch(number: int, root: str, source: Source, jobs: list[dict[str, Any]], code: str) -> dict[str, Any]:
     """A batch of flights, every step a task (`flows.flights.flights`)."""
     return flights(root, source, jobs, code, _as_task, tell_done)
+
+
+@flow(name="batch", persist_result=False, validate_parameters=False)
+def batch(number: int, root: str, source: Source, jobs: list[dict[str, Any]], code: str, handed_over: str) -> None:
+    """A batch in a flow run of its own, in a work pool; its answer is handed over as a file of the warehouse."""
+    with alive(Path(root)):
+        hand_over(Path(root), handed_over, run_batch(number, root, source, jobs, code))
 
 
 @task(name="publish", task_run_name="publish {vehicle_id}", cache_policy=NO_CACHE, persist_result=False)
@@ -150,10 +157,13 @@ def _night(root_of_logs: Path, root: Path, config: str | None, only: Path | None
     remove_abandoned(root)
     with alive(root):
         plan = make_plan(root, root_of_logs, settings, only)
+        write_ledger(root, [*plan.jobs, *plan.copied])
         tell_plan(len(plan.jobs), len(plan.missing))
         outcomes = [*_from_cache(plan), *_calibrate(root, plan, source, parallel)]
         _publish(root, settings, outcomes)
-        return summary(outcomes, plan.copies, plan.copied, root)
+        result = summary(outcomes, plan.copies, plan.copied, root)
+        keep_artifact(result, root)
+        return result
 
 
 def _as_task(work: FlightWork, step: str) -> tuple[Record, bool]:
@@ -186,29 +196,21 @@ def _calibrate(root: Path, plan: Plan, source: Source, parallel: Parallel) -> It
     """Outcomes of the flights with something missing, batch by batch."""
     missing = [job for job in plan.jobs if job.flight_id in plan.missing]
     code = code_digest()
-    inputs: list[Batch] = [
+    inputs: list[dict[str, Any]] = [
         {"number": n, "root": str(root), "source": source, "jobs": [job.plain() for job in jobs], "code": code}
         for n, jobs in enumerate(batches(missing, parallel.workers))
     ]
     if parallel.in_this_process(len(inputs)):
-        for batch in inputs:
-            yield from _outcomes(run_batch(**batch))
+        for given in inputs:
+            yield from _outcomes(run_batch(**given))
         return
-    with task_runner(parallel) as runner:
-        waiting = {runner.submit(run_batch, batch): batch for batch in inputs}
-        for future in as_completed(list(waiting)):
-            for outcome in _outcomes(_answer(future, waiting[future])):
-                tell_done(outcome)
-                yield outcome
-
-
-def _answer(future: Any, batch: Batch) -> dict[str, Any]:
-    try:
-        answer: dict[str, Any] = future.result()
-    except Exception as error:
-        say(f"Batch {batch['number']} was lost ({type(error).__name__}: {error}); its logs follow one by one.")
-        return _one_by_one(batch)
-    return answer
+    for given, answer in answers(parallel, run_batch, inputs):
+        if isinstance(answer, Exception):
+            say(f"Batch {given['number']} was lost ({type(answer).__name__}: {answer}); its logs follow one by one.")
+            answer = _one_by_one(given)
+        for outcome in _outcomes(answer):
+            tell_done(outcome)
+            yield outcome
 
 
 def _outcomes(answer: dict[str, Any]) -> Iterator[Outcome]:
@@ -217,13 +219,13 @@ def _outcomes(answer: dict[str, Any]) -> Iterator[Outcome]:
         raise WarehouseError(*answer["error"])
 
 
-def _one_by_one(batch: Batch) -> dict[str, Any]:
+def _one_by_one(given: dict[str, Any]) -> dict[str, Any]:
     """The flights of a batch whose process died, each in a process of its own: only the guilty one is lost."""
     outcomes: list[dict[str, Any]] = []
-    for job in batch["jobs"]:
+    for job in given["jobs"]:
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
             try:
-                answer = alone.submit(flights, batch["root"], batch["source"], [job], batch["code"]).result()
+                answer = alone.submit(flights, given["root"], given["source"], [job], given["code"]).result()
             except BrokenProcessPool:
                 why = f"The process that calibrated {job['log_uri']} was killed, twice (out of memory?)."
                 outcomes.append(lost(job, why))

@@ -73,15 +73,15 @@ class Outcome:
             "ran": {step: self.why.get(step) for step in self.ran},
         }
 
-    def cause(self) -> str:
-        """Why anything ran, in a few words: the reason of the first step that did, and how many others followed."""
-        if not self.ran:
-            return "nothing new"
-        reason = self.why.get(self.ran[0], NO_RESULT)
-        if reason == NO_RESULT and self.ran[0] == INGEST:
-            return "new log"
-        others = len(self.ran) - 1
-        return f"{self.ran[0]}: {reason}" + (f", and {others} more" if others else "")
+
+def cause(why: Mapping[str, str | None]) -> str:
+    """Why steps run (step → reason, in their order) in a few words: the first reason, and how many others follow."""
+    if not why:
+        return "nothing new"
+    step, reason = next(iter(why.items()))
+    if step == INGEST and reason == NO_RESULT:
+        return "new log"
+    return f"{step}: {reason or NO_RESULT}" + (f", and {len(why) - 1} more" if len(why) > 1 else "")
 
 
 def failed_outcome(job: Job, records: Mapping[str, Record], step: str, reason: str) -> Outcome:

@@ -118,15 +118,17 @@ class FlightWork:
         self._take(step, record)
         return record
 
-    def pending(self) -> list[str]:
-        """Steps whose result is missing, and those that read from them; nothing is run or changed."""
-        missing: list[str] = []
+    def pending(self) -> dict[str, str]:
+        """Steps whose result is missing, and those that read from them, each with why; nothing is run or changed."""
+        missing: dict[str, str] = {}
         for step in STEPS:
             if INGEST in self.records and not self.usable():
                 break
             sources = {name.split(".")[0] for name in STAGES[step].reads.values()} if step != INGEST else set()
-            if sources & set(missing) or self.find(step) is None:
-                missing.append(step)
+            if above := sorted(sources & set(missing)):
+                missing[step] = f"new input: {', '.join(above)}"
+            elif self.find(step) is None:
+                missing[step] = self.why[step]
         return missing
 
     def _take(self, step: str, record: Record) -> None:

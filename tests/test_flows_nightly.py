@@ -255,7 +255,7 @@ def test_a_dry_run_changes_nothing(archive: Path, warehouse: Path, tmp_path: Pat
     shutil.rmtree(warehouse / "stages" / "verify")
     before = file_hashes(warehouse)
     plan = dry_run(archive, warehouse, None, None)
-    assert [log["would_run"] for log in plan["logs"]] == [["verify"]] * 2
+    assert [log["would_run"] for log in plan["logs"]] == [{"verify": "no result yet"}] * 2
     assert file_hashes(warehouse) == before
 
 
