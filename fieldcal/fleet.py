@@ -61,12 +61,13 @@ def outliers(value: Array, sd: Array, level: float) -> np.ndarray:
 
 def _distances(value: Array, sd: Array, inside: np.ndarray) -> tuple[Array, Array]:
     """t of each value against the others that are inside, and its degrees of freedom."""
-    others = inside[None, :] & ~np.eye(len(value), dtype=bool)
-    k = others.sum(axis=1)
-    mean = others @ value / k
-    s2 = np.sum(others * (value[None, :] - mean[:, None]) ** 2, axis=1) / (k - 1)
+    x = value - np.median(value[inside])
+    own = inside * x
+    k = inside.sum() - inside.astype(float)
+    mean = (own.sum() - own) / k
+    s2 = np.maximum((own @ own - own**2) / k - mean**2, 0.0) * k / (k - 1.0)
     spread = np.sqrt(s2 * (1.0 + 1.0 / k) + sd**2)
-    return np.asarray((value - mean) / np.maximum(spread, 1e-300)), np.asarray(k - 1, dtype=float)
+    return np.asarray((x - mean) / np.maximum(spread, 1e-300)), np.asarray(k - 1.0)
 
 
 def moderated_variance(group: np.ndarray, variance: Array, freedom: Array, n_groups: int) -> tuple[Array, Array]:

@@ -24,25 +24,30 @@ SIGNED = ("scale", "bias", "zero_bias")
 VPS, AGREEMENT = "vps", "fit"
 """What stands as `sensor` of rows about the VPS clock and about agreement (Theil's coefficients)."""
 DAY_US = 86_400_000_000
+ATTEMPTS = 10
 
 
 def update_drift(root: Path) -> tuple[str, ...]:
     """Publish the trends of every IMU under the vehicle that carries it now; the vehicles whose table changed.
 
-    A function of the history alone: the same history gives the same bytes, and then nothing is written.
+    A function of the history alone: the same history gives the same bytes, and then nothing is written. When another
+    process publishes flights meanwhile, it is done again, so that whoever ends last leaves the trends of all.
 
     Raises
     ------
     WarehouseError
         As `warehouse.publish.publish`.
     """
-    table = drift_table(root)
-    vehicles = set(table["vehicle_id"].to_list()) | _with_drift(root)
-    return tuple(
-        vehicle_id
-        for vehicle_id in sorted(vehicles)
-        if publish(root, vehicle_id, {"drift": table.filter(pl.col("vehicle_id") == vehicle_id)}, ())
-    )
+    changed: set[str] = set()
+    for _ in range(ATTEMPTS):
+        before = _state(root)
+        table = drift_table(root)
+        for vehicle_id in sorted(set(table["vehicle_id"].to_list()) | _with_drift(root)):
+            if publish(root, vehicle_id, {"drift": table.filter(pl.col("vehicle_id") == vehicle_id)}, ()):
+                changed.add(vehicle_id)
+        if _state(root) == before:
+            break
+    return tuple(sorted(changed))
 
 
 def drift_table(root: Path) -> pl.DataFrame:
@@ -187,6 +192,12 @@ def _moments(day: np.ndarray) -> pl.Series:
     """Days since 1970 as moments, to the microsecond; NaN becomes null."""
     exact = [None if np.isnan(d) else round(float(d) * DAY_US) for d in day]
     return pl.Series(exact, dtype=pl.Int64).cast(pl.Datetime("us", "UTC"))
+
+
+def _state(root: Path) -> list[tuple[str, int, int, int]]:
+    """What the files of the history are; they are replaced whole, so another content is another file."""
+    files = [path for table in ("calibration", "flight", "sync", "fit") for path in history_files(root, table)]
+    return [(str(path), (s := path.stat()).st_ino, s.st_size, s.st_mtime_ns) for path in files]
 
 
 def _with_drift(root: Path) -> set[str]:
