@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from fieldcal import drift, fleet
+from fieldcal.histories import ENOUGH_SESSIONS, Histories
 from flows.ask import existing
 from flows.drift_reasons import reason
 from flows.drift_warm_up import known_slopes
@@ -137,7 +138,7 @@ def history_of_everything(root: Path) -> pl.DataFrame:
 def trends_of(flights: pl.DataFrame) -> tuple[pl.DataFrame, drift.Trends]:
     """(one row a series with what is the same throughout it, its trends) of `history_of_everything`'s rows."""
     numbered = flights.with_columns(row=pl.struct(KEY).rle_id())
-    kept = drift.Histories(
+    kept = Histories(
         row=numbered["row"].to_numpy().astype(np.int64),
         session=flights.select(pl.struct("vehicle_id", "session_id").rank("dense"))
         .to_series()
@@ -181,7 +182,7 @@ def _siblings(rows: pl.DataFrame, trends: drift.Trends) -> tuple[np.ndarray, np.
     value, sd = np.where(clock, scatter, value), np.where(clock, scatter_sd, sd)
     group = rows.select(pl.struct("sensor", "method", "parameter", "axis", "unit").rank("dense")).to_series().to_numpy()
     group = group.astype(np.int64)
-    alone = (trends.n_sessions < drift.ENOUGH_SESSIONS) | ~np.isfinite(value) | ~np.isfinite(sd)
+    alone = (trends.n_sessions < ENOUGH_SESSIONS) | ~np.isfinite(value) | ~np.isfinite(sd)
     group[alone] = group.max() + 1 + np.arange(alone.sum())
     return group, np.where(alone, 0.0, value), np.where(alone, 1.0, sd)
 

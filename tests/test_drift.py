@@ -10,8 +10,9 @@ from drift_support import PER_DEGC, SD, TAU, VALUE, fleet
 from numerics_support import ROUNDING
 from scipy import optimize
 
-from fieldcal.drift import ENOUGH_SESSIONS, FALSE_ALARMS, Histories, analyse, statuses
+from fieldcal.drift import FALSE_ALARMS, analyse, statuses
 from fieldcal.fleet import moderated_variance, outliers, sibling_distance
+from fieldcal.histories import ENOUGH_SESSIONS, Histories
 from fieldcal.random_effects import Grouping, fit_random_effects
 
 HONEST = (0.8, 1.25)
@@ -309,3 +310,12 @@ def test_moderated_variance_is_smyths() -> None:
     assert np.mean((np.log(moderated) - np.log(true)) ** 2) < 0.5 * np.mean((np.log(found) - np.log(true)) ** 2)
     few, _ = moderated_variance(np.zeros(5, dtype=int), found[:5], np.full(5, d), 1)
     assert few.tolist() == found[:5].tolist()
+
+
+def test_without_times_there_is_no_order_to_find_a_step_in() -> None:
+    f = fleet(22, 20)
+    stepped = f.value + STEP * (f.session >= 12)
+    trends = analyse(replace(f, value=stepped).histories(time_day=np.full(f.value.size, np.nan)))
+    assert np.isnan(trends.change_size).all()
+    assert np.isnan(trends.last_z).all()
+    assert np.isfinite(trends.value).all()
