@@ -11,8 +11,8 @@ from fieldcal.statistics import MAD_TO_SIGMA
 
 NEIGHBOURS = 2
 """A point is compared with so many before and so many after it."""
-ISOLATED_SIGMAS, FEW_POINTS = 3.0, 8.0
-"""Distance from every neighbour, in sd of the difference, beyond which a point stands alone: 3 (1 + (8/n)²), for the sd
+ISOLATED_SIGMAS, FEW_POINTS = 3.0, 5.0
+"""Distance from every neighbour, in sd of the difference, beyond which a point stands alone: 3 (1 + (5/n)²), for the sd
 is itself found from the n points."""
 SIDE_SESSIONS = 2
 """Sessions that must lie on either side of a step: one odd session alone is not a step yet."""
@@ -71,7 +71,7 @@ def isolated(row: np.ndarray, residual: Array, variance: Array) -> np.ndarray:
     neighbours agree).
 
     `row` ascending, `residual` without the effect of temperature, `variance` the whole of each point. Rows with fewer
-    than five points have no isolated ones.
+    than five points have no isolated ones, and of five or six a bad one mostly hides in the scatter that it makes.
     """
     n = len(row)
     nearest = np.full(n, np.inf)

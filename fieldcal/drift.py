@@ -6,6 +6,10 @@ u is the scatter between sessions (every power-up has its own), e the flight's o
 flights that agree with none of their neighbours are set aside and steps are looked for; what the record then says of
 each number, with its standard deviation, is in `Trends`. A history is a row; all rows of a fleet go in together: the
 share of false alarms is controlled over all of them.
+
+Sessions are taken as independent draws about the line, and the line as straight. A parameter that wanders from session
+to session (a random walk) is therefore told as drifting or stepping sooner than these shares say, and one whose curve
+over temperature bends is told with its bend as scatter.
 """
 
 from __future__ import annotations
