@@ -71,7 +71,7 @@ def isolated(row: np.ndarray, residual: Array, variance: Array) -> np.ndarray:
     neighbours agree).
 
     `row` ascending, `residual` without the effect of temperature, `variance` the whole of each point. Rows with fewer
-    than five points have no isolated ones, and of five or six a bad one mostly hides in the scatter that it makes.
+    than six points have no isolated ones, and of six or seven a bad one often hides in the scatter that it makes.
     """
     n = len(row)
     nearest = np.full(n, np.inf)
@@ -84,7 +84,7 @@ def isolated(row: np.ndarray, residual: Array, variance: Array) -> np.ndarray:
         nearest[lag:] = np.minimum(nearest[lag:], z)
         nearest[:-lag] = np.minimum(nearest[:-lag], z)
     count = np.bincount(row)[row]
-    return (nearest > ISOLATED_SIGMAS * (1.0 + (FEW_POINTS / count) ** 2)) & (count >= 2 * NEIGHBOURS + 1)
+    return (nearest > ISOLATED_SIGMAS * (1.0 + (FEW_POINTS / count) ** 2)) & (count > 2 * NEIGHBOURS + 1)
 
 
 def strongest_step(
