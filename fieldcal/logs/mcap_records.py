@@ -254,6 +254,13 @@ def check_record(buffer: Buffer, record: Record) -> None:
     check(Fields(buffer, record.body, record.end))
 
 
+def check_first_record(buffer: Buffer, head: ChunkHead) -> None:
+    """Raise Damage unless an uncompressed chunk's content begins with a record that may stand in a chunk."""
+    record = read_record(buffer, head.start, head.end)
+    if record.opcode not in (SCHEMA, CHANNEL, MESSAGE) and record.opcode < FIRST_PRIVATE_OPCODE:
+        raise Damage(f"record {record.opcode:#04x} does not belong into a chunk")
+
+
 def gather(data: NDArray[np.uint8], offsets: NDArray[np.int64], dtype: np.dtype, count: int = 1) -> NDArray:  # type: ignore[type-arg]
     """Values of `dtype` lying at byte `offsets` of `data`: shape (n,), or (n, count) when `count` > 1.
 
