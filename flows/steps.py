@@ -20,6 +20,7 @@ from fieldcal.errors import UnreadableLog
 from fieldcal.pipeline import PIPELINE, Stage, run_stage
 from fieldcal.provenance import run_key
 from fieldcal.results import StageResult
+from fieldcal.tidy import Disordered
 from flows.jobs import Job, file_stamp
 from flows.versions import versions
 from warehouse.errors import WarehouseError
@@ -130,7 +131,7 @@ class FlightWork:
             return self._ingest_record(ingest.rejected("not_readable", self.job.problem), {}, key, keep=False)
         try:
             facts, signals = self._write_signals(whole=False)
-        except ingest.Disordered:
+        except Disordered:
             facts, signals = self._write_signals(whole=True)
         except WarehouseError:
             raise

@@ -10,8 +10,9 @@ import polars as pl
 import pytest
 
 from fieldcal.errors import UnreadableLog
-from fieldcal.ingest import Disordered, TidyLog, TidySignal
+from fieldcal.ingest import TidyLog
 from fieldcal.logs import Columns, LogSummary
+from fieldcal.tidy import Disordered, TidySignal
 
 STEP_NS = 5_000_000
 

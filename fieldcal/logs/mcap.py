@@ -34,8 +34,8 @@ class McapLog:
     Raises
     ------
     UnreadableLog
-        `empty_file`, `not_mcap`, `not_readable`, `no_messages`, `too_many_channels`, `missing_topic`, `missing_field`, `missing_sensor`,
-        `unsupported_schema`; from `batches()` only `no_messages`.
+        `empty_file`, `not_mcap`, `not_readable`, `no_messages`, `too_many_channels`, `missing_topic`,
+        `missing_field`, `missing_sensor`, `unsupported_schema`; from `batches()` only `no_messages`.
     """
 
     def __init__(self, path: Path, vehicle: VehicleLike) -> None:

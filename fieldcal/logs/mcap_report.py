@@ -140,8 +140,8 @@ def _report_contradictions(name: str, tally: Tally, definitions: Definitions, su
         summary.add(
             "channel_redefined",
             len(definitions.redefined),
-            f"{name} defines {', '.join([*definitions.redefined][:5])} twice and differently: what its messages mean is "
-            "uncertain. Record the log again, or split it where the definition changes.",
+            f"{name} defines {', '.join([*definitions.redefined][:5])} twice and differently: what its messages mean "
+            "is uncertain. Record the log again, or split it where the definition changes.",
             fatal=True,
         )
     if tally.unverifiable:
