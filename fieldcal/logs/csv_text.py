@@ -20,8 +20,8 @@ class LineBlocks:
     """Whole lines of a file as UTF-8 bytes, each ended by a single line feed.
 
     Byte-order marks, UTF-16 and the line ends CR LF and CR are taken away, runs of NUL bytes become one. Undecodable
-    bytes of a UTF-8 file are left as they are. `unterminated` tells, once iterated, that the last line had no end; it is
-    not delivered.
+    bytes of a UTF-8 file are left as they are. `unterminated` tells, once iterated, that the last line had no end and
+    was not delivered.
 
     Raises
     ------

@@ -103,6 +103,7 @@ class McapFile:
         self._searched: tuple[int, int | None] | None = None
         self._seen: dict[tuple[int, int, int, int], tuple[int, int]] = {}
         self._lost_chunk = False
+        self._unsure = -1
         self._released = 0
         self._limit = self.size
         self._data_end: int | None = None
@@ -142,7 +143,7 @@ class McapFile:
             record = self._sound_record(position)
             if record is None:
                 declared_end = self._declared_end(position)
-                position = self._resynchronised(position, declared_end)
+                position = self._resynchronised(self._unsure if self._unsure >= 0 else position, declared_end)
                 if position is None and declared_end is None and not self._has_end:
                     self.tally.forget_cut()
             elif record.opcode == CHUNK:
@@ -198,6 +199,7 @@ class McapFile:
                 self.tally.lost[channel_id] += len(offsets)
             return record.end
         self._lost_chunk = record.opcode >= FIRST_PRIVATE_OPCODE
+        self._unsure = record.start if self._lost_chunk else -1
         if record.opcode == METADATA:
             name, pairs = read_metadata(Fields(self.buffer, record.body, record.end))
             self.metadata[name] = pairs
@@ -224,7 +226,7 @@ class McapFile:
             self.tally.damaged_records.append((record.start, "the CRC of the data section does not match"))
 
     def _chunk(self, record: Record) -> Generator[Block, None, int | None]:
-        self._lost_chunk = False
+        self._lost_chunk, self._unsure = False, -1
         opened = self._open_chunk(record.start, record.end)
         if isinstance(opened, str):
             self.tally.damaged_chunks.append((record.start, opened))
@@ -310,7 +312,7 @@ class McapFile:
 
     def _loose(self, record: Record) -> Generator[Block, None, int | None]:
         """Messages outside chunks: a run of them is one block."""
-        self._lost_chunk = False
+        self._lost_chunk, self._unsure = False, -1
         begin, starts, position = record.start, [], record.start
         current: Record | None = record
         while current is not None and current.opcode in (SCHEMA, CHANNEL, MESSAGE):
