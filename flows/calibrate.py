@@ -17,6 +17,7 @@ from flows.jobs import CONFIG_NAME, Job, configuration_of, find_source, with_par
 from flows.rows import flight_row, judged, lead, published_tables, rows_frame, run_rows
 from flows.show import rows_of, unfolded
 from flows.steps import INGEST, plain, sentence
+from flows.threads import one_thread
 from flows.versions import versions
 
 
@@ -54,7 +55,8 @@ def calibrate_log(
         settings = ingest.settings_of(facts, vehicle)
         for stage in PIPELINE:
             try:
-                result = run_stage(stage, tables, settings)
+                with one_thread():
+                    result = run_stage(stage, tables, settings)
             except Exception as error:
                 why = f"{stage.name}: {sentence(job, error)}"
                 result = StageResult(status="failed", reason_code="stage_failed", reason=why)

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 import fieldcal
+from flows.cli_serve import serve, trigger
 from flows.cli_simulate import simulate
 from flows.interrupt import interruptible
 
@@ -34,6 +35,11 @@ AsJson = Annotated[bool, Parameter(name="--json", help="One JSON document on std
 AsCsv = Annotated[bool, Parameter(name="--csv", help="CSV on stdout.")]
 DryRun = Annotated[bool, Parameter(help="List what would run; change nothing.")]
 Workers = Annotated[int, Parameter(help="Processes that calibrate; results do not depend on it.")]
+Runner = Annotated[
+    Literal["process", "dask", "pool"],
+    Parameter(help="Where they run: on this machine, on a Dask cluster, or in the work pool of prefect.yaml."),
+]
+Scheduler = Annotated[str | None, Parameter(help="Address of the Dask scheduler; else a cluster on this machine.")]
 
 
 @app.command
@@ -97,6 +103,8 @@ def nightly(
     /,
     *,
     workers: Workers = 1,
+    runner: Runner = "process",
+    scheduler: Scheduler = None,
     dry_run: DryRun = False,
     as_json: AsJson = False,
     warehouse: Root = None,
@@ -110,7 +118,8 @@ def nightly(
         Folder of logs: ARCHIVE/<vehicle>/<session>/<log>.
     """
     _need_folder(archive, "no_archive", "archive")
-    return _night(archive.absolute(), None, workers, dry_run, as_json, warehouse, config)
+    where = {"runner": runner, "scheduler": scheduler}
+    return _night(archive.absolute(), None, workers, where, dry_run, as_json, warehouse, config)
 
 
 @app.command
@@ -119,6 +128,8 @@ def session(
     /,
     *,
     workers: Workers = 1,
+    runner: Runner = "process",
+    scheduler: Scheduler = None,
     dry_run: DryRun = False,
     as_json: AsJson = False,
     warehouse: Root = None,
@@ -133,7 +144,8 @@ def session(
     """
     _need_folder(folder, "no_session", "session folder")
     own = folder.absolute()
-    return _night(own.parent.parent, own, workers, dry_run, as_json, warehouse, config)
+    where = {"runner": runner, "scheduler": scheduler}
+    return _night(own.parent.parent, own, workers, where, dry_run, as_json, warehouse, config)
 
 
 @app.command
@@ -266,6 +278,7 @@ def _night(
     archive: Path,
     folder: Path | None,
     workers: int,
+    where: dict[str, str | None],
     dry: bool,
     as_json: bool,
     warehouse: Path | None,
@@ -290,7 +303,7 @@ def _night(
     from flows.present_night import NightProgress, print_night
 
     with NightProgress() as progress:
-        result = run_night(archive, root, config, folder, workers, progress)
+        result = run_night(archive, root, config, folder, workers, progress, **where)
     if as_json:
         print_json(result)
     else:
@@ -324,6 +337,8 @@ def _assignments(texts: list[str]) -> dict[str, str]:
     return {name.strip(): value.strip() for name, _, value in pairs}
 
 
+app.command(serve)
+app.command(trigger)
 app.command(simulate)
 
 if __name__ == "__main__":

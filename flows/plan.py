@@ -16,13 +16,13 @@ from warehouse import Warehouse
 class Plan:
     """A night before it runs.
 
-    `unchanged`: flights all of whose results are there, with their records; `missing`: flights with steps to run;
-    `copies`: log_uri → log_uri of the log it is a copy of.
+    `unchanged`: flights all of whose results are there, with their records; `missing`: flights with steps to run, each
+    with why; `copies`: log_uri → log_uri of the log it is a copy of.
     """
 
     jobs: list[Job] = field(default_factory=list)
     unchanged: dict[str, dict[str, Record]] = field(default_factory=dict)
-    missing: dict[str, list[str]] = field(default_factory=dict)
+    missing: dict[str, dict[str, str]] = field(default_factory=dict)
     copies: dict[str, str] = field(default_factory=dict)
     copied: list[Job] = field(default_factory=list)
 

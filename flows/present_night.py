@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console
 
+from flows.outcome import cause
 from flows.present_flight import is_consequence
 from flows.show import number, say, table
 from warehouse import Warehouse
@@ -52,7 +53,8 @@ class NightProgress:
         elif outcome.ran:
             facts = outcome.facts
             why = f" ({facts['reason_code']})" if facts["reason_code"] else ""
-            what = f"{facts['verdict']}{why}, {len(outcome.ran)} stages run"
+            reasons = cause({step: outcome.why.get(step) for step in outcome.ran})
+            what = f"{facts['verdict']}{why}, {len(outcome.ran)} stages run ({reasons})"
             say(f"[{self._done}/{self._total}] {outcome.job.log_uri}: {what}")
 
     def __enter__(self) -> Self:
@@ -109,7 +111,7 @@ def print_plan(console: Console, plan: Mapping[str, Any]) -> None:
 def _would(log: Mapping[str, Any]) -> str:
     if log["copy_of"]:
         return f"nothing: a copy of {log['copy_of']}"
-    return "everything" if log["would_run"][0] == "ingest" else ", ".join(log["would_run"])
+    return cause(log["would_run"])
 
 
 def _worst(root: Path, flights: Sequence[str]) -> list[list[str]]:
