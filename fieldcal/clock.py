@@ -85,13 +85,13 @@ class Order:
     """What became of n stamps in the order of recording.
 
     `wild` (n,): stamps far from those recorded beside them that fill no hole. `stretch` (n,): number of the stretch of
-    one clock that a stamp belongs to. `overlap_ns`: the longest time that two stretches both claim, 0 without one.
+    one clock that a stamp belongs to. `back_ns`: by how much the clock was set back at most, 0 where it was not.
     `far`: how often the stamps jump by over a day.
     """
 
     wild: NDArray[np.bool_]
     stretch: Stamps
-    overlap_ns: int
+    back_ns: int
     far: int
 
 
@@ -126,6 +126,7 @@ def judge(t_ns: Stamps, repeated: NDArray[np.bool_]) -> Order:
         return Order(np.zeros(len(t_ns), bool), np.zeros(len(t_ns), np.int64), 0, 0)
     sound = long[run] & ~repeated
     breaks, overlap_ns = _set_back(t_ns[sound], run[sound])
+    back_ns = overlap_ns + round(interval) if len(breaks) else 0
     runs, start = np.unique(run[sound], return_index=True)
     t = t_ns[sound]
     jumps = t[start[1:]] - t[start[1:] - 1]
@@ -133,7 +134,7 @@ def judge(t_ns: Stamps, repeated: NDArray[np.bool_]) -> Order:
     new = np.zeros(len(long), np.int64)
     new[np.r_[breaks, far]] = 1
     wild = _wild(t_ns, ~long[run] & ~repeated)
-    return Order(wild, np.cumsum(new)[run], overlap_ns, len(far))
+    return Order(wild, np.cumsum(new)[run], back_ns, len(far))
 
 
 def _set_back(t_ns: Stamps, run: Stamps) -> tuple[Stamps, int]:

@@ -43,7 +43,7 @@ class TidySignal:
     def __init__(self, table: str, held_rows: int | None = HELD_ROWS) -> None:
         self.table = table
         self.rows = self.not_finite = self.duplicates = self.conflicts = self.disordered = 0
-        self.wild = self.masked = self.far = self.overlap_ns = self.gaps = self.longest_gap_ns = 0
+        self.wild = self.masked = self.far = self.back_ns = self.gaps = self.longest_gap_ns = 0
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self._unwrap = clock.Unwrapper()
@@ -127,8 +127,10 @@ class TidySignal:
         counts = np.bincount(judged.stretch, weights=~judged.wild & ~copy)
         longest = judged.stretch == int(np.argmax(counts))
         self.wild, self.masked = int(judged.wild.sum()), int((~longest & ~judged.wild & ~copy).sum())
-        self.overlap_ns, self.far = judged.overlap_ns, judged.far
-        return frame.filter(pl.Series(longest & ~judged.wild))
+        self.back_ns, self.far = judged.back_ns, judged.far
+        kept = longest & ~judged.wild
+        self.disordered = int(np.count_nonzero(np.maximum.accumulate(t[kept]) > t[kept]))
+        return frame.filter(pl.Series(kept))
 
     def _copies(self, frame: pl.DataFrame) -> tuple[np.ndarray, np.ndarray]:
         """Of sorted rows: which are the first of their stamp, and which of the others repeat it in every value."""
@@ -207,16 +209,16 @@ class TidySignal:
                 f"{name}: the counter behind the stamps of {table} began again {self._unwrap.wraps} time(s) after "
                 f"{self._unwrap.period_ns * 1e-9:.3f} s; its period was added.",
             )
-        if self.overlap_ns > CLOCK_RESET_NS:
+        if self.back_ns > CLOCK_RESET_NS:
             yield Finding(
                 "clock_reset",
                 self.masked,
-                f"{name}: the stamps of {table} step back by {self.overlap_ns * 1e-9:.3f} s into time "
+                f"{name}: the stamps of {table} step back by {self.back_ns * 1e-9:.3f} s into time "
                 f"that is recorded already ({self.masked} rows): the clock was reset. Split the log where it was.",
                 fatal=sensors,
             )
         elif self.masked:
-            what = f"set back by {self.overlap_ns * 1e-9:.3f} s" if self.overlap_ns else "set by more than a day"
+            what = f"set back by {self.back_ns * 1e-9:.3f} s" if self.back_ns else "set by more than a day"
             yield Finding(
                 "clock_set",
                 self.masked,
@@ -224,7 +226,7 @@ class TidySignal:
                 f"{self.masked} rows beside it were left out.",
                 loses_data=sensors,
             )
-        elif self.disordered > self.wild:
+        elif self.disordered:
             yield Finding(
                 "out_of_order",
                 self.disordered,

@@ -227,5 +227,5 @@ def judge_vectors(tables: Tables, s: Settings) -> StageResult:
         else:
             parts.append(tables[name])
     if not parts:
-        return StageResult(status="refused", reason_code="no_vectors", reason="Neither vector triad was calibrated.")
+        return StageResult(status="absent", reason_code="no_vectors", reason="Neither vector triad was calibrated.")
     return StageResult({"calibration": pl.concat(parts)})
