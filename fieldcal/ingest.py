@@ -5,6 +5,8 @@ Tidy: sorted by stamp, no row twice, one row a stamp, finite readings. Whatever 
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -17,10 +19,15 @@ from fieldcal.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.flight import flight_settings
 from fieldcal.logs import Finding, LogReader, LogSummary, open_log
+from fieldcal.logs.discovery import folder_parts
 from fieldcal.logs.interface import EPOCH_KNOWN_AFTER_NS
 from fieldcal.tidy import HELD_ROWS, Disordered, TidySignal
 
 LEAST_SAMPLES = 10
+SECONDS_ALLOWED = 60.0
+TOO_SLOW = "too_slow"
+"""The one refusal that another try may not meet again."""
+
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -35,9 +42,13 @@ class TidyLog:
         What findings call it.
     whole : bool
         Hold every row until the end: for logs that were found `Disordered`.
+    seconds : float
+        How long reading may take.
     """
 
-    def __init__(self, reader: LogReader, name: str, *, whole: bool = False) -> None:
+    def __init__(self, reader: LogReader, name: str, *, whole: bool = False, seconds: float = math.inf) -> None:
+        self._give_up = time.monotonic() + seconds
+        self._seconds = seconds
         self._reader = reader
         self._name = name
         self._held_rows = None if whole else HELD_ROWS
@@ -52,11 +63,17 @@ class TidyLog:
         Raises
         ------
         UnreadableLog
-            The log cannot be read, or nothing in it is usable.
+            The log cannot be read, nothing in it is usable, or it takes too long (`too_slow`).
         Disordered
             See `TidySignal.add`.
         """
         for table, columns in self._reader.batches():
+            if time.monotonic() > self._give_up:
+                raise UnreadableLog(
+                    TOO_SLOW,
+                    f"{self._name} was still being read after {self._seconds:.0f} s, {SECONDS_ALLOWED:.0f} s and 1 s "
+                    "for every MB are allowed. Check the disk; the next night tries again.",
+                )
             signal = self._signals.setdefault(table, TidySignal(table, self._held_rows))
             for frame in signal.add(columns):
                 yield table, self._seen(table, frame)
@@ -124,7 +141,9 @@ class TidyLog:
 
 def tidy_log(path: Path, vehicle: Vehicle, *, whole: bool = False) -> TidyLog:
     """Open a log for tidying. Raises as `open_log`."""
-    return TidyLog(open_log(path, vehicle), path.name, whole=whole)
+    reader = open_log(path, vehicle)
+    size = sum(part.stat().st_size for part in (folder_parts(path) if path.is_dir() else [path]))
+    return TidyLog(reader, path.name, whole=whole, seconds=SECONDS_ALLOWED + size / 1e6)
 
 
 def logged_units(path: Path, vehicle: Vehicle) -> dict[str, str]:

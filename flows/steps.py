@@ -179,7 +179,7 @@ class FlightWork:
         if facts["verdict"] != "rejected" and file_stamp(Path(self.job.path)) != tuple(self.job.stamp):
             why = f"{self.job.log_uri} changed while it was read; the next night takes it when it is complete."
             return self._ingest_record(ingest.rejected("changed_while_read", why), {}, key, keep=False)
-        return self._ingest_record(facts, signals, key, keep=True)
+        return self._ingest_record(facts, signals, key, keep=facts["reason_code"] != ingest.TOO_SLOW)
 
     def _write_signals(self, *, whole: bool) -> tuple[dict[str, Any], dict[str, Any]]:
         """Stream the log into the signal tables; nothing appears unless the whole log came through."""
