@@ -13,7 +13,7 @@ from typing import Any
 import polars as pl
 
 from fieldcal.results import StageResult, fatal_fault
-from fieldcal.stages import attitude, comparison, gyroscope, preparation, sanity, vector_triads, vps
+from fieldcal.stages import attitude, comparison, gyroscope, preparation, sanity, vector_triads, vps, warm_up
 
 Run = Callable[[Mapping[str, pl.DataFrame], Mapping[str, Any]], StageResult]
 
@@ -188,6 +188,15 @@ PIPELINE: tuple[Stage, ...] = (
         ("gyroscope",),
     ),
     Stage(
+        "warm_up",
+        warm_up.find_warm_up,
+        {"imu": "ingest.imu", "temperature": "ingest.temperature", **FAULTS},
+        ("imu",),
+        ("calibration",),
+        ("units", "manoeuvre_max_gap_s"),
+        ("gyroscope",),
+    ),
+    Stage(
         "vps_sync",
         vps.synchronise_vps,
         {
@@ -224,6 +233,7 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
     "calibration": (
         "vectors.calibration",
         "gyro_output.calibration",  # equation error's rows too
+        "warm_up.calibration",
     ),
     "fit": ("verify.fit",),
     "sync": ("vps_sync.sync",),

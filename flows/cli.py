@@ -11,6 +11,9 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 import fieldcal
+from flows.cli_drift import drift
+from flows.cli_fly import apply, export
+from flows.cli_report import report as report_command
 from flows.cli_serve import serve, trigger
 from flows.cli_simulate import simulate
 from flows.interrupt import interruptible
@@ -65,6 +68,7 @@ def calibrate(
     method: Annotated[Literal["serial"], Parameter(show_choices=True)] = "serial",
     profile: Literal["full", "onboard", "paper"] | None = None,
     set_: Annotated[list[str] | None, Parameter(name="--set")] = None,
+    report: Annotated[Path | None, Parameter(help="Write the flight's report to this HTML file too.")] = None,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -84,10 +88,15 @@ def calibrate(
     set_
         Overrule a stage parameter: --set smoothing_cutoff_hz=6.
     """
-    from flows.calibrate import calibrate_log
-    from flows.show import console, print_json
+    from flows.calibrate import run_log
+    from flows.show import console, print_json, say
 
-    document = calibrate_log(log, config, vehicle_id=vehicle, profile=profile, changes=_assignments(set_ or []))
+    result = run_log(log, config, vehicle_id=vehicle, profile=profile, changes=_assignments(set_ or []))
+    document = result.document
+    if report is not None:
+        from flows.report import log_report
+
+        say(f"Report: {log_report(result, report)}")
     if as_json:
         print_json(document)
     else:
@@ -365,9 +374,13 @@ def _assignments(texts: list[str]) -> dict[str, str]:
     return {name.strip(): value.strip() for name, _, value in pairs}
 
 
+app.command(report_command, name="report")
 app.command(serve)
 app.command(trigger)
 app.command(simulate)
+app.command(drift)
+app.command(export)
+app.command(apply)
 
 if __name__ == "__main__":
     main()
