@@ -27,6 +27,7 @@ app = App(
     version=fieldcal.__version__,
     result_action="return_value",
     help_format="plaintext",
+    suppress_keyboard_interrupt=False,
     default_parameter=Parameter(negative=""),
 )
 
@@ -236,6 +237,34 @@ def verify(
             print(f"{damage['path']}: {damage['reason']}")
         say(f"{result['files']} files checked, {len(result['damaged'])} damaged")
         print(f"content_sha256 {result['content_sha256'] or 'unknown: tables are damaged'}")
+    return OK if result["ok"] else FAILED
+
+
+@app.command
+def doctor(
+    *,
+    archive: Path | None = None,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Check versions, disk, permissions, locks and server, and say what to do.
+
+    Parameters
+    ----------
+    archive
+        Check that the logs of this archive can be read too.
+    """
+    from flows.doctor import examine
+    from flows.show import print_json
+
+    result = examine(_root(warehouse), archive)
+    if as_json:
+        print_json(result)
+    else:
+        for check in result["checks"]:
+            advice = f"\n{'':23}{check['advice']}" if check["advice"] else ""
+            print(f"{check['status']:8} {check['check']:14}{check['found']}{advice}")
     return OK if result["ok"] else FAILED
 
 

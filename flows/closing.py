@@ -94,4 +94,4 @@ def _remembered(root: Path) -> Mapping[str, Any]:
 
 
 def _place(root: Path) -> Path:
-    return root / "stages" / "closing.json"
+    return root / "night" / "closing.json"
