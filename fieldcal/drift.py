@@ -196,8 +196,7 @@ def _among_siblings(fit: Regression, p: Prepared, kind: np.ndarray) -> Regressio
     """The scatter of each row, claims included, drawn towards its siblings' (`fleet.moderated_variance`)."""
     claimed = p.mean_variance + fit.flight_variance
     total = np.where(p.enough, fit.session_variance + claimed, np.nan)
-    kinds, number = np.unique(kind, return_inverse=True)
-    moderated, freedom = moderated_variance(number, total * p.unit**2, fit.freedom, len(kinds))
+    moderated, freedom = moderated_variance(kind, total * p.unit**2, fit.freedom)
     moderated = moderated / p.unit**2
     ratio = np.where(p.enough, moderated / total, 1.0)
     return replace(

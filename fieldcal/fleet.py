@@ -15,7 +15,7 @@ REFERENCE_LEVEL = 0.05
 LEAST_FREEDOM = 0.5
 
 
-def sibling_distance(group: np.ndarray, value: Array, sd: Array, n_groups: int) -> tuple[Array, Array]:
+def sibling_distance(group: np.ndarray, value: Array, sd: Array) -> tuple[Array, Array]:
     """(distance from the siblings in sd, its p-value), each (n,).
 
     The values of a group scatter about a common mean as siblings do, of unknown variance, plus each value's own sd². A
@@ -24,8 +24,7 @@ def sibling_distance(group: np.ndarray, value: Array, sd: Array, n_groups: int) 
     count. NaN and p = 1 in groups with fewer than six.
     """
     z, p = np.full(len(value), np.nan), np.ones(len(value))
-    for g in range(n_groups):
-        members = np.flatnonzero(group == g)
+    for members in _groups(group):
         if len(members) > ENOUGH_SIBLINGS:
             out = outliers(value[members], sd[members], REFERENCE_LEVEL)
             z[members], freedom = _distances(value[members], sd[members], ~out)
@@ -70,7 +69,7 @@ def _distances(value: Array, sd: Array, inside: np.ndarray) -> tuple[Array, Arra
     return np.asarray((x - mean) / np.maximum(spread, 1e-300)), np.asarray(k - 1.0)
 
 
-def moderated_variance(group: np.ndarray, variance: Array, freedom: Array, n_groups: int) -> tuple[Array, Array]:
+def moderated_variance(group: np.ndarray, variance: Array, freedom: Array) -> tuple[Array, Array]:
     """(variance, freedom), each (n,), after each variance has been drawn towards its siblings'.
 
     A variance from few degrees of freedom is itself uncertain; siblings tell what is usual. Theirs are taken as draws
@@ -84,8 +83,8 @@ def moderated_variance(group: np.ndarray, variance: Array, freedom: Array, n_gro
     """
     result, total = variance.copy(), freedom.copy()
     usable = np.isfinite(variance) & (variance > 0.0) & (freedom > LEAST_FREEDOM)
-    for g in range(n_groups):
-        members = np.flatnonzero((group == g) & usable)
+    for everyone in _groups(group):
+        members = everyone[usable[everyone]]
         if len(members) <= ENOUGH_SIBLINGS:
             continue
         half = 0.5 * freedom[members]
@@ -97,6 +96,12 @@ def moderated_variance(group: np.ndarray, variance: Array, freedom: Array, n_gro
         total[members] = freedom[members] + d0
         result[members] = (d0 * s0 + freedom[members] * variance[members]) / total[members]
     return result, total
+
+
+def _groups(label: np.ndarray) -> list[np.ndarray]:
+    """Indices of equal labels."""
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
 
 
 def _inverse_trigamma(y: float) -> float:

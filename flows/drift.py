@@ -62,7 +62,7 @@ def table_of(flights: pl.DataFrame) -> pl.DataFrame:
         return empty_frame("drift")
     rows, trends = trends_of(flights)
     group, value, sd = _siblings(rows, trends)
-    fleet_z, fleet_p = fleet.sibling_distance(group, value, sd, int(group.max()) + 1)
+    fleet_z, fleet_p = fleet.sibling_distance(group, value, sd)
     result = rows.with_columns(
         **{
             name: pl.Series(np.asarray(column, dtype=float), nan_to_null=True)
@@ -170,7 +170,7 @@ def _siblings(rows: pl.DataFrame, trends: drift.Trends) -> tuple[np.ndarray, np.
     A VPS clock's lag is arbitrary, its scatter from session to session is not: there the logarithm of the scatter."""
     value, sd = trends.value.copy(), trends.sd.copy()
     axis = ["imu_id", "sensor", "method", "axis"]
-    table = rows.with_columns(index=pl.int_range(pl.len()), value=pl.Series(value))
+    table = rows.with_columns(value=pl.Series(value))
     scale = table.filter(pl.col("parameter") == "scale").select(*axis, sign=pl.col("value").sign())
     sign = table.join(scale, on=axis, how="left", maintain_order="left")["sign"].fill_null(1.0).to_numpy()
     signed = rows["parameter"].is_in(SIGNED).to_numpy()

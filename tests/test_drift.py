@@ -259,7 +259,7 @@ def test_p_values_of_siblings_are_uniform() -> None:
     rng = np.random.default_rng(21)
     n, group = 12, np.repeat(np.arange(400), 12)
     sd = 0.3 * np.ones(400 * n)
-    _, p = sibling_distance(group, np.hypot(1.0, sd) * rng.normal(size=400 * n), sd, 400)
+    _, p = sibling_distance(group, np.hypot(1.0, sd) * rng.normal(size=400 * n), sd)
     for level in (0.05, 0.5):
         assert np.mean(p < level) == pytest.approx(level, rel=0.25)
 
@@ -269,14 +269,14 @@ def test_an_odd_sibling_is_named_and_few_siblings_are_not_judged() -> None:
     value = rng.normal(size=60)
     value[12] += 25.0
     group = np.repeat(np.arange(5), 12)
-    z, p = sibling_distance(group, value, np.full(60, 0.1), 5)
+    z, p = sibling_distance(group, value, np.full(60, 0.1))
     assert np.flatnonzero(p < 1e-5).tolist() == [12]
     assert z[12] > 10.0
     # The same distance with an uncertainty as large says nothing.
     uncertain = np.full(60, 0.1)
     uncertain[12] = 25.0
-    assert sibling_distance(group, value, uncertain, 5)[1][12] > 0.1
-    z, p = sibling_distance(np.zeros(5, dtype=int), value[:5], np.ones(5), 1)
+    assert sibling_distance(group, value, uncertain)[1][12] > 0.1
+    z, p = sibling_distance(np.zeros(5, dtype=int), value[:5], np.ones(5))
     assert np.isnan(z).all()
     assert (p == 1.0).all()
 
@@ -306,11 +306,11 @@ def test_moderated_variance_is_smyths() -> None:
     d, d0, s0 = 4.0, 10.0, 3.0
     true = d0 * s0 / rng.chisquare(d0, 4000)
     found = true * rng.chisquare(d, 4000) / d
-    moderated, freedom = moderated_variance(np.zeros(4000, dtype=int), found, np.full(4000, d), 1)
+    moderated, freedom = moderated_variance(np.zeros(4000, dtype=int), found, np.full(4000, d))
     assert freedom - d == pytest.approx(d0, rel=0.15)
     assert moderated == pytest.approx((d0 * s0 + d * found) / (d0 + d), rel=0.1)
     assert np.mean((np.log(moderated) - np.log(true)) ** 2) < 0.5 * np.mean((np.log(found) - np.log(true)) ** 2)
-    few, _ = moderated_variance(np.zeros(5, dtype=int), found[:5], np.full(5, d), 1)
+    few, _ = moderated_variance(np.zeros(5, dtype=int), found[:5], np.full(5, d))
     assert few.tolist() == found[:5].tolist()
 
 
