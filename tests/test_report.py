@@ -31,7 +31,7 @@ from flows.report import (
     write_night_reports,
     write_vehicle_report,
 )
-from flows.report.plot import thinned, with_gaps, without_wraps
+from flows.report.plot import INK, thinned, with_gaps, without_wraps
 from flows.report.trend import predicted
 from flows.rows import flight_row, published_tables, rows_frame, run_rows
 from flows.rows import lead as lead_of
@@ -93,6 +93,7 @@ def sound(path: Path) -> Page:
         for name in ("aria-labelledby", "clip-path"):
             for target in re.findall(r"#?([\w-]+)\)?", (attributes.get(name) or "").replace("url(", "")):
                 assert target in ids, target
+    assert not [colour for colour in INK.values() if colour in path.read_text(encoding="utf-8")]
     assert "://" not in re.sub(r'xmlns="http://www.w3.org/2000/svg"', "", path.read_text(encoding="utf-8"))
     assert [a.get("role") for a in page.named("svg")] == ["img"] * len(page.named("svg"))
     return page
