@@ -13,7 +13,7 @@ from typing import Any
 import polars as pl
 
 from fieldcal.results import StageResult
-from fieldcal.stages import attitude, comparison, gyroscope, preparation, vector_triads, vps
+from fieldcal.stages import attitude, comparison, gyroscope, preparation, vector_triads, vps, warm_up
 
 Run = Callable[[Mapping[str, pl.DataFrame], Mapping[str, Any]], StageResult]
 
@@ -157,6 +157,14 @@ PIPELINE: tuple[Stage, ...] = (
         (*GYRO, *VECTORS, "gyro_output", "initial_attitude", "shooting_s"),
     ),
     Stage(
+        "warm_up",
+        warm_up.find_warm_up,
+        {"imu": "ingest.imu", "temperature": "ingest.temperature"},
+        ("imu",),
+        ("calibration",),
+        ("units", "manoeuvre_max_gap_s"),
+    ),
+    Stage(
         "vps_sync",
         vps.synchronise_vps,
         {
@@ -192,6 +200,7 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
         "magnetometer.calibration",
         "accelerometer_pass2.calibration",
         "gyro_output.calibration",  # equation error's rows too
+        "warm_up.calibration",
     ),
     "fit": ("verify.fit",),
     "sync": ("vps_sync.sync",),

@@ -11,6 +11,8 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 import fieldcal
+from flows.cli_drift import drift
+from flows.cli_fly import apply, export
 from flows.cli_report import report as report_command
 from flows.cli_serve import serve, trigger
 from flows.cli_simulate import simulate
@@ -348,6 +350,9 @@ app.command(report_command, name="report")
 app.command(serve)
 app.command(trigger)
 app.command(simulate)
+app.command(drift)
+app.command(export)
+app.command(apply)
 
 if __name__ == "__main__":
     main()

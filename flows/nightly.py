@@ -24,9 +24,11 @@ from prefect.states import Completed
 
 from fieldcal.configuration import Configuration
 from flows.alive import alive
+from flows.artifact import keep_artifact
 from flows.flights import flights, lost, one_step
 from flows.history import publish_vehicle, withdraw
 from flows.jobs import Source, configuration_of, find_source
+from flows.log_ledger import write_ledger
 from flows.outcome import Outcome, summary
 from flows.plan import Plan, make_plan
 from flows.pool import hand_over
@@ -155,10 +157,13 @@ def _night(root_of_logs: Path, root: Path, config: str | None, only: Path | None
     remove_abandoned(root)
     with alive(root):
         plan = make_plan(root, root_of_logs, settings, only)
+        write_ledger(root, [*plan.jobs, *plan.copied])
         tell_plan(len(plan.jobs), len(plan.missing))
         outcomes = [*_from_cache(plan), *_calibrate(root, plan, source, parallel)]
         _publish(root, settings, outcomes)
-        return summary(outcomes, plan.copies, plan.copied, root)
+        result = summary(outcomes, plan.copies, plan.copied, root)
+        keep_artifact(result, root)
+        return result
 
 
 def _as_task(work: FlightWork, step: str) -> tuple[Record, bool]:

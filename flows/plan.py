@@ -8,6 +8,7 @@ from typing import Any
 
 from fieldcal.configuration import Configuration
 from flows.jobs import Job, find_jobs, without_copies
+from flows.log_ledger import read_ledger
 from flows.steps import FlightWork, Record
 from warehouse import Warehouse
 
@@ -29,7 +30,7 @@ class Plan:
 
 def make_plan(root: Path, archive: Path, configuration: Configuration, session: Path | None = None) -> Plan:
     """Find the logs and decide for each which steps must run."""
-    found = find_jobs(archive, configuration, session)
+    found = find_jobs(archive, configuration, session, read_ledger(root))
     kept, copies = without_copies(found, *_known(root, archive))
     plan = Plan(copies=copies, copied=[job for job in found if job.log_uri in copies])
     for job in kept:
