@@ -239,6 +239,34 @@ def verify(
     return OK if result["ok"] else FAILED
 
 
+@app.command
+def doctor(
+    *,
+    archive: Path | None = None,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Check versions, disk, permissions, locks and server, and say what to do.
+
+    Parameters
+    ----------
+    archive
+        Check that the logs of this archive can be read too.
+    """
+    from flows.doctor import examine
+    from flows.show import print_json
+
+    result = examine(_root(warehouse), archive)
+    if as_json:
+        print_json(result)
+    else:
+        for check in result["checks"]:
+            advice = f"\n{'':23}{check['advice']}" if check["advice"] else ""
+            print(f"{check['status']:8} {check['check']:14}{check['found']}{advice}")
+    return OK if result["ok"] else FAILED
+
+
 def main(tokens: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
     sys.exit(run(sys.argv[1:] if tokens is None else tokens))

@@ -80,9 +80,7 @@ def table_of(flights: pl.DataFrame) -> pl.DataFrame:
         change_at=_moments(trends.change_day),
         status=pl.Series(drift.statuses(trends, fleet_p).tolist(), dtype=pl.String),
     )
-    told = result.with_columns(
-        reason=pl.Series([reason(row) for row in result.iter_rows(named=True)], dtype=pl.String)
-    )
+    told = result.with_columns(reason=pl.Series([reason(row) for row in result.iter_rows(named=True)], dtype=pl.String))
     return told.select(TABLES["drift"].column_names).sort(KEY)
 
 

@@ -23,6 +23,7 @@ from fieldcal.errors import UnreadableLog
 from fieldcal.pipeline import PIPELINE, Stage, run_stage
 from fieldcal.provenance import run_key, source_digest
 from fieldcal.results import StageResult
+from fieldcal.tidy import Disordered
 from flows.jobs import Job, file_stamp
 from flows.reasons import why_it_runs
 from flows.versions import versions
@@ -169,7 +170,7 @@ class FlightWork:
             return self._ingest_record(ingest.rejected("not_readable", self.job.problem), {}, key, keep=False)
         try:
             facts, signals = self._write_signals(whole=False)
-        except ingest.Disordered:
+        except Disordered:
             facts, signals = self._write_signals(whole=True)
         except WarehouseError:
             raise
@@ -178,7 +179,7 @@ class FlightWork:
         if facts["verdict"] != "rejected" and file_stamp(Path(self.job.path)) != tuple(self.job.stamp):
             why = f"{self.job.log_uri} changed while it was read; the next night takes it when it is complete."
             return self._ingest_record(ingest.rejected("changed_while_read", why), {}, key, keep=False)
-        return self._ingest_record(facts, signals, key, keep=True)
+        return self._ingest_record(facts, signals, key, keep=facts["reason_code"] != ingest.TOO_SLOW)
 
     def _write_signals(self, *, whole: bool) -> tuple[dict[str, Any], dict[str, Any]]:
         """Stream the log into the signal tables; nothing appears unless the whole log came through."""

@@ -247,6 +247,11 @@ VERSIONS = Column(
     provenance=True,
 )
 
+# --- faults
+FAULT_NUMBER = Column("number", _F64, "as its reason says", "what decided: a share, a ratio or a reading")
+FAULT_LIMIT = Column("limit", _F64, "as its reason says", "what the number was held against")
+FATAL = Column("fatal", pa.bool_(), "", "no stage that needs the sensor runs")
+
 # --- drift
 N_FLIGHTS = Column("n_flights", _I64, "1", "flights the regression used")
 VALUE_AT_25DEGC = Column("value_at_25degc", _F64, "named by column unit", "regressed value at 25 degC")

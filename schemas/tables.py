@@ -38,6 +38,14 @@ _SIGNALS = (
 
 _STAGES = (
     Table(
+        "faults",
+        "stage",
+        1,
+        "what is wrong with a sensor's readings; axis is empty for the whole triad",
+        (c.SENSOR, c.AXIS, c.REASON_CODE, c.FAULT_NUMBER, c.FAULT_LIMIT, c.FATAL, c.REASON),
+        ("sensor", "axis", "reason_code"),
+    ),
+    Table(
         "segments",
         "stage",
         1,
