@@ -71,7 +71,11 @@ def fleet_page(root: Path, links: Links, as_of: datetime | None) -> Page:
         *((f"vehicles: {status}", str(n)) for status, n in statuses.items() if n),
     ]
     overview: list[Part] = [
-        Table("A row per vehicle. Status is the worst of its IMU's parameters in the table drift.", _COLUMNS, rows),
+        Table(
+            "A row per vehicle (fieldcal report --vehicle V writes its page). Status: the worst of its IMU's trends.",
+            _COLUMNS,
+            rows,
+        ),
         Text(
             "A flight is usable when at least one constant came out of it. Worst TIC: the greatest Theil inequality"
             " coefficient of the last usable flight's comparisons (smoothed readings), with its rms error. Key"
