@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldcal.errors import UnreadableLog
+from fieldcal.logs.mapped import map_file
 from fieldcal.logs.mcap_chunks import CHUNK_CAP_BYTES, decompress, locate_messages
 from fieldcal.logs.mcap_records import (
     CHANNEL,
@@ -93,7 +94,7 @@ class McapFile:
 
     def __init__(self, path: Path) -> None:
         self.name = path.name
-        self.buffer = _map(path)
+        self.buffer = map_file(path)
         self.size = len(self.buffer)
         self.definitions = Definitions()
         self.metadata: dict[str, dict[str, str]] = {}
@@ -282,11 +283,10 @@ class McapFile:
             return str(damage)
 
     def _refused(self, searching: bool) -> str:
-        why = f"unpacking more than {TOTAL_CAP_BYTES} bytes from chunks that grow over {TOTAL_CAP_RATIO} times"
-        if searching:
-            why = f"searching more than {TOTAL_CAP_BYTES} bytes behind damage for the next chunk"
-            self.tally.stopped = f"{why} is refused"
-        return f"{why} is refused"
+        if not searching:
+            return f"unpacking more than {TOTAL_CAP_BYTES} bytes from chunks that grow {TOTAL_CAP_RATIO} times is refused"
+        self.tally.stopped = f"searching more than {TOTAL_CAP_BYTES} bytes behind damage for a chunk is refused"
+        return self.tally.stopped
 
     def _indexes(self, position: int) -> tuple[list[NDArray[np.uint64]], int]:
         """The message indexes that follow a chunk, and the position behind them."""
@@ -405,15 +405,3 @@ class McapFile:
             channel_id = int.from_bytes(self.buffer[record.body : record.body + 2], "little")
             return record.end if channel_id in self.definitions.channels else None
         return record.end
-
-
-def _map(path: Path) -> mmap.mmap:
-    try:
-        with path.open("rb") as stream:
-            if not path.stat().st_size:
-                raise UnreadableLog("empty_file", f"{path.name} is empty. Nothing was recorded, or the copy failed.")
-            return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-    except (OSError, ValueError) as error:
-        raise UnreadableLog(
-            "not_readable", f"{path.name} cannot be read: {error}. Check disk and permissions."
-        ) from error
