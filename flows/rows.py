@@ -70,7 +70,7 @@ def run_rows(leading: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]
 
 
 def judged(facts: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """The facts with what the stages found: a stage that failed makes an `ok` log `partial`; faults are findings too."""
+    """The facts with what the stages found: a stage that failed makes an `ok` log `partial`, faults are findings."""
     faults = records["sanity"]["measured"].get("faults", []) if "sanity" in records else []
     told = [{"code": fault["code"], "count": 1, "sentence": fault["sentence"]} for fault in faults]
     facts = {**facts, "findings": [*facts["findings"], *told]}

@@ -14,7 +14,9 @@ from logs_support import EXAMPLES, messages_by_mcap_ros2, needs_examples, stamp_
 
 from fieldcal.configuration import Configuration, load
 from fieldcal.errors import UnreadableLog
+from fieldcal.ingest import read_flight, settings_of
 from fieldcal.logs import find_logs, open_log, read_log
+from fieldcal.pipeline import PIPELINE, run_stage
 
 pytestmark = needs_examples
 ROOT = Path(EXAMPLES or ".")
@@ -78,6 +80,38 @@ def test_damaged_csv_keeps_all_whole_rows(configuration: Configuration, expected
         )
         for table in ("imu", "magnetometer", "vps"):
             assert frames[table].equals(whole[table].head(frames[table].height))
+
+
+VERDICTS = {
+    "broad_06_cut": ("partial", "unterminated_row"),
+    "broad_06_decimal_comma": ("ok", None),
+    "broad_06_units_row": ("ok", None),
+    "broad_02_ff512.mcap": ("partial", "damaged_chunk"),
+    "broad_02_power_loss.mcap": ("partial", "truncated"),
+    "empty.mcap": ("rejected", "empty_file"),
+}
+
+
+def test_damaged_recordings_get_the_verdicts_they_should(configuration: Configuration) -> None:
+    logs = [log for log in find_logs(ROOT) if log.vehicle_id.startswith("damaged")]
+    found = {}
+    for log in logs:
+        _, facts = read_flight(log.path, configuration.vehicle(log.vehicle_id))
+        found[log.path.name] = (facts["verdict"], facts["reason_code"])
+    assert found == VERDICTS
+
+
+def test_sound_recordings_have_sane_sensors(configuration: Configuration) -> None:
+    """No real recording is refused for what only a broken one shows."""
+    for log in find_logs(ROOT):
+        vehicle = configuration.vehicle(log.vehicle_id)
+        tables, facts = read_flight(log.path, vehicle)
+        if not tables:
+            continue
+        assert facts["verdict"] == VERDICTS.get(log.path.name, ("ok", None))[0]
+        signals = {f"ingest.{name}": frame for name, frame in tables.items()}
+        result = run_stage(PIPELINE[0], signals, settings_of(facts, vehicle))
+        assert not result.tables["faults"]["fatal"].any(), result.reason
 
 
 def test_mcap_columns_are_what_mcap_ros2_decodes(configuration: Configuration) -> None:

@@ -194,7 +194,7 @@ def test_chunks_that_grow_too_much_are_left_out_beyond_a_total(
     monkeypatch.setattr(mcap_file, "TOTAL_CAP_BYTES", 100_000)
     monkeypatch.setattr(mcap_file, "TOTAL_CAP_RATIO", 1)
     tables, summary = read_or_none(tmp_path, whole)
-    assert "unpacking more than 100000 bytes" in summary.findings[0].sentence
+    assert "unpacking over 100000 bytes" in summary.findings[0].sentence
     assert any(finding.loses_data for finding in summary.findings)
     assert 0 < tables["imu"].height < 400
 

@@ -284,8 +284,8 @@ class McapFile:
 
     def _refused(self, searching: bool) -> str:
         if not searching:
-            return f"unpacking more than {TOTAL_CAP_BYTES} bytes from chunks that grow {TOTAL_CAP_RATIO} times is refused"
-        self.tally.stopped = f"searching more than {TOTAL_CAP_BYTES} bytes behind damage for a chunk is refused"
+            return f"unpacking over {TOTAL_CAP_BYTES} bytes from chunks that grow over {TOTAL_CAP_RATIO} times refused"
+        self.tally.stopped = f"searching over {TOTAL_CAP_BYTES} bytes behind damage for a chunk is refused"
         return self.tally.stopped
 
     def _indexes(self, position: int) -> tuple[list[NDArray[np.uint64]], int]:
