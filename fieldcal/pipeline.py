@@ -13,7 +13,7 @@ from typing import Any
 import polars as pl
 
 from fieldcal.results import StageResult
-from fieldcal.stages import attitude, comparison, gyroscope, preparation, vector_triads, vps
+from fieldcal.stages import attitude, comparison, gyroscope, joint, preparation, vector_triads, vps
 
 Run = Callable[[Mapping[str, pl.DataFrame], Mapping[str, Any]], StageResult]
 
@@ -157,6 +157,36 @@ PIPELINE: tuple[Stage, ...] = (
         (*GYRO, *VECTORS, "gyro_output", "initial_attitude", "shooting_s"),
     ),
     Stage(
+        "joint",
+        joint.estimate_jointly,
+        {
+            **SAMPLES,
+            "imu": "ingest.imu",
+            "magnetometer_log": "ingest.magnetometer",
+            "magnetometer": "magnetometer.calibration",
+            "accelerometer": "accelerometer_pass2.calibration",
+            "gyroscope": "gyro_output.calibration",
+        },
+        ("samples",),
+        ("calibration", "covariance", "attitude"),
+        (
+            *AXES,
+            "method",
+            "polarity",
+            "units",
+            "nominal_scale",
+            "reference_reading",
+            "field_ned",
+            "field_unit",
+            "gravity_mps2",
+            "gravity_sign",
+            "lever_arm_m",
+            "ellipsoid_max_scale_sd",
+            "ellipsoid_max_residual",
+            "gyro_max_scale_sd",
+        ),
+    ),
+    Stage(
         "vps_sync",
         vps.synchronise_vps,
         {
@@ -164,6 +194,8 @@ PIPELINE: tuple[Stage, ...] = (
             "vps": "ingest.vps",
             "attitude": "attitude_pass2.attitude",
             "gyroscope": "gyro_output.calibration",
+            "joint": "joint.calibration",
+            "joint_attitude": "joint.attitude",
         },
         ("imu",),
         ("sync", "vps_aligned"),
@@ -179,8 +211,10 @@ PIPELINE: tuple[Stage, ...] = (
             "attitude": "attitude_pass2.attitude",
             "gyroscope": "gyro_output.calibration",
             "vps_aligned": "vps_sync.vps_aligned",
+            "joint": "joint.calibration",
+            "joint_attitude": "joint.attitude",
         },
-        ("samples", "attitude"),
+        ("samples",),
         ("fit",),
         (*VECTORS, *SMOOTHING, "differentiation_window_s", "initial_attitude"),
     ),
@@ -192,6 +226,7 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
         "magnetometer.calibration",
         "accelerometer_pass2.calibration",
         "gyro_output.calibration",  # equation error's rows too
+        "joint.calibration",
     ),
     "fit": ("verify.fit",),
     "sync": ("vps_sync.sync",),

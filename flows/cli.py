@@ -56,7 +56,7 @@ def calibrate(
     /,
     *,
     vehicle: str | None = None,
-    method: Annotated[Literal["serial"], Parameter(show_choices=True)] = "serial",
+    method: Literal["serial", "joint"] | None = None,
     profile: Literal["full", "onboard", "paper"] | None = None,
     set_: Annotated[list[str] | None, Parameter(name="--set")] = None,
     as_json: AsJson = False,
@@ -72,7 +72,7 @@ def calibrate(
     vehicle
         The vehicle in fieldcal.toml; else the folder two levels above the log.
     method
-        How the sensors are calibrated.
+        "serial", one step after the other, or "joint", all in one likelihood; else what fieldcal.toml says.
     profile
         Presets of the stages.
     set_
@@ -81,7 +81,8 @@ def calibrate(
     from flows.calibrate import calibrate_log
     from flows.show import console, print_json
 
-    document = calibrate_log(log, config, vehicle_id=vehicle, profile=profile, changes=_assignments(set_ or []))
+    changes = _assignments(set_ or [])
+    document = calibrate_log(log, config, vehicle_id=vehicle, profile=profile, method=method, changes=changes)
     if as_json:
         print_json(document)
     else:

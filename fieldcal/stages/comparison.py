@@ -39,11 +39,12 @@ FIT_SCHEMA = {
 
 def verify_fit(tables: Tables, s: Settings) -> StageResult:
     """Everything estimated → fit: the paper's five TICs and one more, raw and smoothed, with physical units."""
-    samples, attitude = tables["samples"], tables["attitude"]
+    samples, attitude = tables["samples"], tables.get("attitude")
     t = seconds(samples["t_ns"], int(samples["t_ns"][0]))
     segment = samples["segment"].to_numpy()
-    smoothed_q = matrix(attitude, QUATERNION)
-    sides = {"raw": _raw_attitude(tables, s), "smoothed": smoothed_q}
+    sides = {}
+    if attitude is not None:
+        sides = {"raw": _raw_attitude(tables, s), "smoothed": matrix(attitude, QUATERNION)}
     gyros = {
         method: constants(tables["gyroscope"], "gyroscope", method, refused_too=True)
         for method in ("equation_error", "output_error")
@@ -83,19 +84,24 @@ def verify_fit(tables: Tables, s: Settings) -> StageResult:
                 )
             else:
                 relative = propagate_stretches(t, rate, segment)
-                weight = attitude["weight"].to_numpy()
+                weight = np.ones(len(t)) if attitude is None else attitude["weight"].to_numpy()
                 model = start_stretches(relative, q_sensor, segment, weight, fixed=s["initial_attitude"] == "fixed")
                 add("attitude_propagated", method, name, signal, theil_attitude(q_sensor, model), "deg")
                 if vps is not None and vps_t is not None:
-                    _propagated_against_vps(add, signal, t, relative, segment, vps, vps_t, s)
+                    _propagated_against_vps(add, method, signal, t, relative, segment, vps, vps_t, s)
             if vps is not None and vps_t is not None:
-                near = bridged(t, vps_t)
-                if near.any():
-                    body = np.column_stack([np.interp(vps_t, t, c) for c in (rate @ axes.T).T])
-                    vps_rate = matrix(vps, RATE_COLUMNS)
-                    if signal == "smoothed":
-                        vps_rate = _smoothed_blocks(vps_t, vps_rate, s)
-                    add("body_rate", method, "vps", signal, theil(vps_rate[near], body[near]), "rad/s")
+                _rates_against_vps(add, method, signal, t, rate @ axes.T, vps, vps_t, s)
+    joint = constants(tables["joint"], "gyroscope") if "joint" in tables else None
+    if joint is not None and vps is not None and vps_t is not None:
+        q = matrix(tables["joint_attitude"], QUATERNION)
+        own, near = interpolate_attitude(t, continuous(q), vps_t)
+        if near.any():
+            add("attitude", "joint", "vps", "smoothed", theil_attitude(matrix(vps, QUATERNION)[near], own[near]), "deg")
+        for signal, prefix in (("raw", ""), ("smoothed", "smoothed_")):
+            rate = sensor.calibrate(matrix(samples, triad("gyroscope", prefix)), *joint)
+            relative = propagate_stretches(t, rate, segment)
+            _propagated_against_vps(add, "joint", signal, t, relative, segment, vps, vps_t, s)
+            _rates_against_vps(add, "joint", signal, t, rate @ axes.T, vps, vps_t, s)
     if not rows:
         return StageResult(status="absent", reason_code="nothing_to_compare", reason="No reference to compare with.")
     return StageResult({"fit": pl.DataFrame(rows, schema=FIT_SCHEMA)}, measured={"comparisons": len(rows)})
@@ -122,8 +128,30 @@ def _raw_attitude(tables: Tables, s: Settings) -> Array:
     return wahba.attitudes(vectors, reference, sigma, method=s["attitude"], declination=declination).q
 
 
+def _rates_against_vps(
+    add: Callable[..., None],
+    method: str,
+    signal: str,
+    t: Array,
+    rate: Array,
+    vps: pl.DataFrame,
+    vps_t: Array,
+    s: Settings,
+) -> None:
+    """Body rates (n, 3), rad/s, against those of the VPS."""
+    near = bridged(t, vps_t)
+    if not near.any():
+        return
+    body = np.column_stack([np.interp(vps_t, t, c) for c in rate.T])
+    vps_rate = matrix(vps, RATE_COLUMNS)
+    if signal == "smoothed":
+        vps_rate = _smoothed_blocks(vps_t, vps_rate, s)
+    add("body_rate", method, "vps", signal, theil(vps_rate[near], body[near]), "rad/s")
+
+
 def _propagated_against_vps(
     add: Callable[..., None],
+    method: str,
     signal: str,
     t: Array,
     relative: Array,
@@ -140,7 +168,7 @@ def _propagated_against_vps(
     if len(own) < 10:
         return
     model = start_stretches(own, reference, part, np.ones(len(own)), fixed=False)
-    add("attitude_propagated", "output_error", "vps", signal, theil_attitude(continuous(reference), model), "deg")
+    add("attitude_propagated", method, "vps", signal, theil_attitude(continuous(reference), model), "deg")
 
 
 def _smoothed_blocks(t: Array, x: Array, s: Settings) -> Array:
