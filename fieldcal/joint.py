@@ -237,7 +237,7 @@ class _Prior:
 
 
 def _least_part(state: State, step: Array, theta: Array, layout: Mapping[str, slice]) -> float:
-    """Part of a step that may be taken: no attitude turns too far (LARGEST_TURN_RAD), nor any scale (LARGEST_RELATIVE)."""
+    """Part of a step that may be taken: no attitude by more than LARGEST_TURN_RAD, no scale by LARGEST_RELATIVE."""
     longest = [float(np.max(np.abs(step[:, :3]))) / LARGEST_TURN_RAD]
     for name, own in layout.items():
         if own.stop - own.start == 6:

@@ -4,7 +4,8 @@ Multiple shooting with soft joints. Between neighbouring knots the gyroscope is 
 the next begins the attitude may jump by what gyroscope noise makes of the interval. Beside the attitude a knot carries
 the translation that the accelerometer senses: velocity, acceleration and jerk of a velocity that is white noise behind
 three equal low-passes, so that the acceleration has no constant part, as that of a vehicle that stays in sight. All
-knots are eliminated from the normal equations at once by a banded Cholesky factor (the Schur complement), in time linear in the record's length.
+knots are eliminated from the normal equations at once by a banded Cholesky factor (the Schur complement), in time
+linear in the record's length.
 """
 
 from __future__ import annotations
