@@ -308,31 +308,27 @@ def accumulate(
     root = np.sqrt(weight)
     h, g = rows.by_knot * root[..., None], rows.by_parameter * root[..., None]
     signs = probe.sensors[rows.own] * (root > 0)
-    share = model.knots.share[model.at[rows.own], None]
-    transposed = h.transpose(0, 2, 1)
-    coupled = np.concatenate(
-        [transposed @ np.concatenate([g, (rows.residual * root)[..., None]], axis=2), transposed * signs[:, None, :]],
-        axis=2,
-    ).reshape(len(h), -1)
-    squared = (transposed @ h).reshape(len(h), -1)
-    moments = np.concatenate([squared, squared * share, squared * share**2, coupled, coupled * share], axis=1)
-    sums = sums_by_interval(model, moments, rows.own, ties)
-    knots = ties.stop - ties.start
-    both, late, square = (sums[:, 36 * i : 36 * (i + 1)].reshape(knots, 6, 6) for i in range(3))
-    all_coupled, late_coupled = (x.reshape(knots, 6, -1) for x in np.split(sums[:, 108:], 2, axis=1))
+    share = model.knots.share[model.at[rows.own], None, None]
+    m, r = signs.shape
+    met = np.zeros((m + 1, r, 12 + p + 1 + r))  # one row of nothing, to fill shorter intervals with
+    met[:m, :, :6], met[:m, :, 6:12] = (1.0 - share) * h, share * h  # knot before, knot after
+    met[:m, :, 12 : 12 + p], met[:m, :, 12 + p] = g, rows.residual * root
+    met[:m, range(r), range(13 + p, 13 + p + r)] = signs
+    met = np.take(met, _padded(model, rows.own, ties), axis=0).reshape(ties.stop - ties.start, -1, met.shape[2])
+    product = met[..., :12].transpose(0, 2, 1) @ met  # (knots, 12, 12 + p + 1 + r)
     here = np.arange(ties.start, ties.stop)
     inside = here + 1 < len(normal.diagonal)
     following = here[inside] + 1
     pair = (slice(None), SENSED[:, None], SENSED[None, :])
     for into, knot, part in (
-        (normal.diagonal, here, both - 2 * late + square),
-        (normal.diagonal, following, square[inside]),
-        (normal.below, here[inside], (late - square)[inside]),
+        (normal.diagonal, here, product[:, :6, :6]),
+        (normal.diagonal, following, product[inside, 6:, 6:12]),
+        (normal.below, here[inside], product[inside, 6:, :6]),
     ):
         block = into[knot]
         block[pair] += part
         into[knot] = block
-    for knot, part in ((here, all_coupled - late_coupled), (following, late_coupled[inside])):
+    for knot, part in ((here, product[:, :6, 12:]), (following, product[inside, 6:, 12:])):
         right = normal.right[knot]
         right[:, SENSED, : p + 1] += part[..., : p + 1]
         right[:, SENSED, p + 1] += part[..., p + 1 :].sum(axis=2)
@@ -344,6 +340,14 @@ def accumulate(
     own_reaction = np.einsum("nrp,nr->pr", g, signs)
     normal.parameters_right[:, 1] += own_reaction.sum(axis=1)
     groups[1][:] += own_reaction
+
+
+def _padded(model: Model, own: slice, ties: slice) -> np.ndarray:
+    """Rows of each of a chunk's intervals (knots, most rows); one past the last row where there are fewer."""
+    starts = np.searchsorted(model.at[own], model.knots.index[ties])
+    counts = np.diff(np.r_[starts, own.stop - own.start])
+    step = np.arange(max(int(counts.max()), 1))
+    return np.where(step < counts[:, None], starts[:, None] + step, own.stop - own.start)
 
 
 def sums_by_interval(model: Model, x: Array, own: slice, ties: slice) -> Array:

@@ -24,7 +24,7 @@ from fieldcal.rotation import (
 )
 from fieldcal.smoothing import differentiate_samples, smooth_samples
 
-SPACING_S = 0.05
+SPACING_S = 0.08
 START_CUTOFF_HZ = 4.0
 FOLLOW_HZ, FOLLOW_SIDE_S = 0.2, 1.5
 # Rates for the lever arm: their derivative's noise would shrink it (a regressor), so no more than the motion needs.
