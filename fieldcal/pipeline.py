@@ -168,7 +168,7 @@ PIPELINE: tuple[Stage, ...] = (
             "gyroscope": "gyro_output.calibration",
         },
         ("samples",),
-        ("calibration", "covariance", "attitude"),
+        ("calibration", "covariance", "attitude", "held_out"),
         (
             *AXES,
             "method",
@@ -213,6 +213,7 @@ PIPELINE: tuple[Stage, ...] = (
             "vps_aligned": "vps_sync.vps_aligned",
             "joint": "joint.calibration",
             "joint_attitude": "joint.attitude",
+            "joint_held_out": "joint.held_out",
         },
         ("samples",),
         ("fit",),

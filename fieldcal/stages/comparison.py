@@ -12,7 +12,7 @@ from fieldcal import attitude as wahba
 from fieldcal import sensor, smoothing
 from fieldcal.frames import QUATERNION, constants, matrix, seconds, triad
 from fieldcal.gyro_equation import predicted_quaternion_rate
-from fieldcal.gyro_output import propagate_stretches, start_stretches
+from fieldcal.gyro_output import propagate_stretches, shooting_segments, start_stretches
 from fieldcal.manoeuvre import contiguous
 from fieldcal.metrics import Fit, theil, theil_attitude
 from fieldcal.results import StageResult
@@ -20,6 +20,8 @@ from fieldcal.rotation import Array, continuous, slerp
 from fieldcal.stages.attitude import body_vectors, known_vectors, sensor_attitude
 from fieldcal.stages.inputs import Settings, Tables, differentiate_by_segment, spread_of
 from fieldcal.stages.vps import BRIDGE_S, RATE_COLUMNS, bridged, interpolate_attitude
+
+HELD_OUT_STRETCH_S = 10.0
 
 FIT_SCHEMA = {
     "quantity": pl.String,
@@ -55,8 +57,10 @@ def verify_fit(tables: Tables, s: Settings) -> StageResult:
     axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
     rows: list[dict[str, Any]] = []
 
-    def add(quantity: str, method: str, reference: str, signal: str, fit: Fit, unit: str) -> None:
-        rows.append(_fit_row(quantity, method, reference, signal, fit, unit))
+    def add(
+        quantity: str, method: str, reference: str, signal: str, fit: Fit, unit: str, sample: str = "all"
+    ) -> None:
+        rows.append(_fit_row(quantity, method, reference, signal, sample, fit, unit))
 
     name = s["attitude"]
     for signal, q in sides.items():
@@ -102,17 +106,21 @@ def verify_fit(tables: Tables, s: Settings) -> StageResult:
             relative = propagate_stretches(t, rate, segment)
             _propagated_against_vps(add, "joint", signal, t, relative, segment, vps, vps_t, s)
             _rates_against_vps(add, "joint", signal, t, rate @ axes.T, vps, vps_t, s)
+    if "joint_held_out" in tables:
+        _held_out(add, tables, t, segment, vps, vps_t, s)
     if not rows:
         return StageResult(status="absent", reason_code="nothing_to_compare", reason="No reference to compare with.")
     return StageResult({"fit": pl.DataFrame(rows, schema=FIT_SCHEMA)}, measured={"comparisons": len(rows)})
 
 
-def _fit_row(quantity: str, method: str, reference: str, signal: str, fit: Fit, unit: str) -> dict[str, Any]:
+def _fit_row(
+    quantity: str, method: str, reference: str, signal: str, sample: str, fit: Fit, unit: str
+) -> dict[str, Any]:
     parts = [v if np.isfinite(v) else None for v in (fit.bias, fit.variance, fit.covariance)]
     return dict(
         zip(
             FIT_SCHEMA,
-            (quantity, method, reference, signal, "all", float(fit.tic), *parts, fit.rms, unit, fit.n_samples),
+            (quantity, method, reference, signal, sample, float(fit.tic), *parts, fit.rms, unit, fit.n_samples),
             strict=True,
         )
     )
@@ -126,6 +134,47 @@ def _raw_attitude(tables: Tables, s: Settings) -> Array:
     reference = np.array([s["field_ned"], [0.0, 0.0, 1.0]])
     declination = float(np.arctan2(s["field_ned"][1], s["field_ned"][0]))
     return wahba.attitudes(vectors, reference, sigma, method=s["attitude"], declination=declination).q
+
+
+def _held_out(
+    add: Callable[..., None],
+    tables: Tables,
+    t: Array,
+    segment: np.ndarray,
+    vps: pl.DataFrame | None,
+    vps_t: Array | None,
+    s: Settings,
+) -> None:
+    """Constants of the first part of the flight predict the rest: attitude over stretches, and body rates, against the
+    VPS, else against the joint attitude of the whole flight."""
+    constants_then = constants(tables["joint_held_out"], "gyroscope")
+    if constants_then is None:
+        return
+    late = tables["samples"]["t_ns"].to_numpy() >= tables["joint_held_out"]["from_ns"][0]
+    t, segment = t[late], segment[late]
+    rate = sensor.calibrate(matrix(tables["samples"], triad("gyroscope"))[late], *constants_then)
+    if vps is not None and vps_t is not None:
+        name, reference_t, q = "vps", vps_t, matrix(vps, QUATERNION)
+        rates = matrix(vps, RATE_COLUMNS)
+    elif "joint_attitude" in tables:
+        name, reference_t, q = "joint", t, matrix(tables["joint_attitude"], QUATERNION)[late]
+        rates = None
+    else:
+        return
+    stretch = shooting_segments(t, segment, HELD_OUT_STRETCH_S)
+    near = bridged(t, reference_t) & (reference_t >= t[0])
+    if near.sum() < 10:
+        return
+    own = slerp(t, propagate_stretches(t, rate, stretch), reference_t)[near]
+    part = stretch[np.clip(np.searchsorted(t, reference_t, side="right") - 1, 0, len(t) - 1)][near]
+    to_sensor = sensor_attitude(q, s)[near]
+    model = start_stretches(own, to_sensor, part, np.ones(len(own)), fixed=False)
+    fit = theil_attitude(continuous(to_sensor), model)
+    add("attitude_propagated", "joint", name, "raw", fit, "deg", "held_out")
+    if rates is not None:
+        axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+        body = np.column_stack([np.interp(reference_t[near], t, c) for c in (rate @ axes.T).T])
+        add("body_rate", "joint", name, "raw", theil(rates[near], body), "rad/s", "held_out")
 
 
 def _rates_against_vps(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,7 @@ SERIAL_METHODS: dict[str, tuple[str | None, ...]] = {
 UNITS = {"magnetometer": "", "accelerometer": "m/s^2", "gyroscope": "rad/s"}
 # A magnetometer's readings count as one each only where they are about as many as the gyroscope's.
 SPARSE = 0.9
+HELD_IN_SHARE = 0.7
 MAX_GYRO_NOISE_SHARE = 0.5
 
 
@@ -56,7 +58,43 @@ def estimate_jointly(tables: Tables, s: Settings) -> StageResult:
         fit = fit_joint(model, start, try_lever_arm=arm is None)
     except (UnusableFlight, EstimationError) as error:
         return refusal(error, "joint estimate")
-    return _written(fit, tables, s, axes)
+    result = _written(fit, tables, s, axes)
+    return replace(result, tables={**result.tables, **_held_out(fit, readings, tables, s, arm)})
+
+
+def _held_out(
+    fit: JointFit, readings: Readings, tables: Tables, s: Settings, arm: Array | None
+) -> dict[str, pl.DataFrame]:
+    """Gyroscope constants from the first part of the flight alone, with `from_ns`, where the rest begins: `verify`
+    predicts that. None where the part determines nothing."""
+    split = int(HELD_IN_SHARE * len(readings.t))
+    part = replace(
+        readings,
+        t=readings.t[:split],
+        segment=readings.segment[:split],
+        turning=readings.turning[:, :split],
+        gyroscope=readings.gyroscope[:split],
+        accelerometer=None if readings.accelerometer is None else readings.accelerometer[:split],
+        magnetometer=None if readings.magnetometer is None else readings.magnetometer[:split],
+    )
+    known = {name: fit.constants(name)[:2] for name in SENSORS if name in fit.layout}
+    try:
+        own = fit_joint(*joint_start.prepare(part, known, lever_arm=arm), try_lever_arm=arm is None)
+    except (UnusableFlight, EstimationError):
+        return {}
+    scale, bias, covariance = own.constants("gyroscope")
+    rows = triad_rows(
+        "gyroscope",
+        METHOD,
+        np.diag(scale),
+        bias,
+        covariance,
+        unit="rad/s",
+        logged_unit=s["units"]["gyroscope"],
+        reference_reading=reference_reading(s, "gyroscope", readings.gyroscope),
+        temperature_degc=mean_temperature(tables),
+    )
+    return {"held_out": calibration_rows(rows).with_columns(from_ns=pl.lit(int(tables["samples"]["t_ns"][split])))}
 
 
 def readings_of(tables: Tables, s: Settings) -> Readings:

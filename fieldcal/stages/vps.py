@@ -24,6 +24,7 @@ from fieldcal.rotation import (
 )
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Settings, Tables
+from fieldcal.sync_attitude import refine_by_attitude
 
 NED_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # rotation of ENU components to NED
 
@@ -81,6 +82,17 @@ def synchronise_vps(tables: Tables, s: Settings) -> StageResult:
             {"status": "refused", "peak": error.measured.get("peak"), "runner_up": error.measured.get("runner_up")}
         )
         return StageResult({"sync": row}, "refused", error.reason_code, str(error), {**measured, **error.measured})
+    if "joint_attitude" in tables:
+        own_attitude = tables["joint_attitude"]
+        fit = refine_by_attitude(
+            seconds(own_attitude["t_ns"], origin),
+            matrix(own_attitude, QUATERNION),
+            own_attitude["segment"].to_numpy(),
+            t_vps,
+            q_vps,
+            fit,
+        )
+        measured["synchronised_by"] = "attitude"
     row = _sync_row(
         {
             "lag_s": fit.lag_s - base_ns * 1e-9,
