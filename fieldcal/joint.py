@@ -314,7 +314,8 @@ def _logged_units(model: Model, state: State, path: Trajectory, walk: float) -> 
     knots = model.knots
     jump = np.einsum("kij,kj->ki", body_from_inertial(state.q[:-1]), path.jump)
     square = np.sum(jump**2 / (walk * knots.interval_s)[:, None], axis=0)
-    return np.asarray(square / state.values["gyroscope"][:3])
+    # Noise makes one each; more is misfit that the walk's bound keeps from being noise, and no reason to move.
+    return np.asarray(np.minimum(square, knots.joined.sum()) / state.values["gyroscope"][:3])
 
 
 def _integrated_translation(model: Model, state: State, reaction: tuple[Array, Array], response: Array) -> Array:

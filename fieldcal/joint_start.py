@@ -27,6 +27,7 @@ from fieldcal.smoothing import differentiate_samples, smooth_samples
 SPACING_S = 0.08
 START_CUTOFF_HZ = 4.0
 FOLLOW_HZ, FOLLOW_SIDE_S = 0.2, 1.5
+TRUST = np.array([0.1, 0.03])  # relative length of field and gravity off by this: half the weight
 # Rates for the lever arm: their derivative's noise would shrink it (a regressor), so no more than the motion needs.
 LEVER_ARM_CUTOFF_HZ, LEVER_ARM_SIDE_S = 1.5, 1.0
 
@@ -115,7 +116,9 @@ def _start_attitude(
         reference = np.array([r.field_ned, down])
         q = continuous(wahba.attitudes(both, reference, np.array([0.02, 0.02]), declination=heading).q)
         gyro = gyro if gyro is not None else _gyro_from_attitude(r, q)
-        return _carried_by_gyroscope(r, q, gyro), gyro
+        lengths = np.linalg.norm(both, axis=2) / [np.linalg.norm(r.field_ned), abs(r.gravity_mps2)] - 1.0
+        trust = 1.0 / (1.0 + np.sum((lengths / TRUST) ** 2, axis=1))
+        return _carried_by_gyroscope(r, q, gyro, trust), gyro
     if not sensed or gyro is None:
         raise UnusableFlight(
             "no_start",
@@ -127,14 +130,15 @@ def _start_attitude(
     return _levelled(relative, vector, r.field_ned if name == "magnetometer" else down), gyro
 
 
-def _carried_by_gyroscope(r: Readings, q: Array, gyro: Constants) -> Array:
-    """Attitudes that turn as the gyroscope says and follow `q` (n, 4) over seconds: sudden errors of the vectors stay
-    out."""
+def _carried_by_gyroscope(r: Readings, q: Array, gyro: Constants, trust: Array) -> Array:
+    """Attitudes that turn as the gyroscope says and follow `q` (n, 4), weighted by `trust` (n,), over seconds: sudden
+    errors of the vectors stay out."""
     relative = propagate_stretches(r.t, r.gyroscope * gyro[0] + gyro[1], r.segment)
     offset = multiply(q, conjugate(relative))
     for a, b in stretches(r.segment):
         offset[a:b] = continuous(offset[a:b])
-    return multiply(normalise(low_passed(r.t, r.segment, offset, FOLLOW_HZ, FOLLOW_SIDE_S)), relative)
+    weighted = low_passed(r.t, r.segment, offset * trust[:, None], FOLLOW_HZ, FOLLOW_SIDE_S)
+    return multiply(normalise(weighted), relative)
 
 
 def _levelled(relative: Array, vector: Array, reference: Array) -> Array:
