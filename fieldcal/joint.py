@@ -41,6 +41,7 @@ LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
 # At most this multiple of it (a band limit hides a factor of about 4): a field that varies from place to place would
 # otherwise be taken for a gyroscope that walks.
 MOST_WALK = 10.0
+STIFFENING = 4.0
 LEAST_ACCELERATION_MPS2, LEAST_WALK, LEAST_VARIANCE = 2e-3, 1e-9, 1e-8
 MAX_ITERATIONS = 50
 # Settled: every step below this part of what one could claim as standard deviation, every noise level below it too.
@@ -140,7 +141,7 @@ def _iterate(model: Model, state: State, levels: Levels | None, *, dip: bool, le
     probe = Probe.draw(len(model.at), 3 * len(model.rows), len(knots.index))
     path = trajectory(model, state)
     residual = residuals(model, state, path)
-    levels = levels or _first_levels(model, state, residual)
+    levels = levels or _first_levels(model, state, path, residual)
     for iteration in range(1, MAX_ITERATIONS + 1):
         weight = _robust_weight(model, residual, levels)
         normal, moved, reaction = _normal_equations(model, state, path, layout, p, weight, levels, probe)
@@ -246,11 +247,12 @@ def _least_part(state: State, step: Array, theta: Array, layout: Mapping[str, sl
     return 1.0 / max(1.0, *longest)
 
 
-def _first_levels(model: Model, state: State, residual: Array) -> Levels:
+def _first_levels(model: Model, state: State, path: Trajectory, residual: Array) -> Levels:
     known = np.repeat(np.column_stack([model.triads[name].known for name in model.rows]), 3, axis=1)
     sigma = np.array([robust_sigma(r[k]) for r, k in zip(residual.T, known.T, strict=True)])
     variance = np.maximum(sigma**2, LEAST_VARIANCE)
-    walk = max(WALK_START * gyro_walk(model, state), LEAST_WALK)
+    jumped = np.sum(path.jump**2) / (3.0 * np.sum(model.knots.interval_s * model.knots.joined))
+    walk = max(WALK_START * gyro_walk(model, state), float(jumped), LEAST_WALK)
     return Levels(variance, np.ones(len(variance)), walk, ACCELERATION_START_MPS2)
 
 
@@ -273,7 +275,8 @@ def _levels(model: Model, residual: Array, levels: Levels, absorbed: Array, squa
     return Levels(
         variance,
         _colour(model, residual, weight),
-        float(np.clip(walk, LEAST_WALK, max(most_walk, LEAST_WALK))),
+        # A start that jumps is loose at first and stiffens by steps: the linear equations hold for small turns only.
+        float(np.clip(walk, LEAST_WALK, max(most_walk, levels.walk / STIFFENING, LEAST_WALK))),
         max(float(strength), LEAST_ACCELERATION_MPS2),
     )
 
