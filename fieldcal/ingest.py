@@ -5,6 +5,8 @@ Tidy: sorted by stamp, no row twice, one row a stamp, finite readings. Whatever 
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -16,175 +18,17 @@ import polars as pl
 from fieldcal.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.flight import flight_settings
-from fieldcal.logs import SIGNAL_COLUMNS, Columns, Finding, LogReader, LogSummary, batch_frame, open_log
+from fieldcal.logs import Finding, LogReader, LogSummary, open_log
+from fieldcal.logs.discovery import folder_parts
+from fieldcal.logs.interface import EPOCH_KNOWN_AFTER_NS
+from fieldcal.tidy import HELD_ROWS, Disordered, TidySignal
 
-SENSOR_TABLES = ("imu", "magnetometer", "vps")
-MAY_BE_UNKNOWN = ("px_m", "py_m", "pz_m", "altitude_m")
-HELD_ROWS = 1 << 17
-CLOCK_RESET_NS = 1_000_000_000
-MOST_STRAGGLERS = 0.01
-MOST_INTERVALS = 1 << 20
+LEAST_SAMPLES = 10
+SECONDS_ALLOWED = 60.0
+TOO_SLOW = "too_slow"
+"""The one refusal that another try may not meet again."""
+
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-
-
-class Disordered(Exception):
-    """A row belongs before rows that were handed on already: the log must be tidied as a whole."""
-
-
-class TidySignal:
-    """One signal being tidied. Rows are held back so that small disorder is sorted while streaming.
-
-    Parameters
-    ----------
-    table : str
-        Signal table.
-    held_rows : int or None
-        How many of the latest rows are held back; None holds all until the end.
-    """
-
-    def __init__(self, table: str, held_rows: int | None = HELD_ROWS) -> None:
-        self.table = table
-        self.rows = self.not_finite = self.duplicates = self.conflicts = self.disordered = self.reset = 0
-        self.largest_step_back_ns = 0
-        self._run = self._switches = 0
-        self._runs: set[int] = set()
-        self._last_run: int | None = None
-        self.first_ns: int | None = None
-        self.last_ns: int | None = None
-        self._held_rows = held_rows
-        self._held: list[pl.DataFrame] = []
-        self._n_held = 0
-        self._latest_ns: int | None = None
-        self._previous_ns: int | None = None
-        self._intervals = np.empty(0, np.int64)
-        self._keep_every = 1
-
-    def add(self, columns: Columns) -> Iterator[pl.DataFrame]:
-        """Take a batch; rows that no later one can come before.
-
-        Raises
-        ------
-        Disordered
-            A row comes before rows that were yielded already.
-        """
-        frame = self._finite(batch_frame(self.table, columns))
-        if frame.is_empty():
-            return
-        t = frame["t_ns"].to_numpy()
-        if self.last_ns is not None and int(t.min()) <= self.last_ns:
-            raise Disordered(self.table)
-        latest = np.maximum.accumulate(t if self._latest_ns is None else np.r_[self._latest_ns, t])
-        before = latest[:-1] if self._latest_ns is not None else np.r_[t[0], latest[:-1]]
-        behind = np.maximum(before - t, 0)
-        self.disordered += int(np.count_nonzero(behind))
-        previous = np.r_[t[0] if self._previous_ns is None else self._previous_ns, t[:-1]]
-        run = self._run + np.cumsum(np.abs(t - previous) > CLOCK_RESET_NS)
-        self._latest_ns, self._previous_ns, self._run = int(latest[-1]), int(t[-1]), int(run[-1])
-        self._held.append(frame.with_columns(behind=pl.Series(behind), run=pl.Series(run)))
-        self._n_held += len(frame)
-        if self._held_rows is not None and self._n_held > 2 * self._held_rows:
-            held = pl.concat(self._held).sort("t_ns", maintain_order=True)
-            stamps = held["t_ns"].to_numpy()
-            cut = int(np.searchsorted(stamps, stamps[-self._held_rows]))
-            self._held, self._n_held = [held[cut:]], len(held) - cut
-            if cut:
-                yield self._one_a_stamp(held[:cut])
-
-    def finish(self) -> Iterator[pl.DataFrame]:
-        """The rows still held."""
-        if self._n_held:
-            held = pl.concat(self._held).sort("t_ns", maintain_order=True)
-            self._held, self._n_held = [], 0
-            yield self._one_a_stamp(held)
-
-    def rate_hz(self) -> float | None:
-        """Median rate; None below two samples."""
-        if self._intervals.size == 0:
-            return None
-        return float(1e9 / np.median(self._intervals))
-
-    def _finite(self, frame: pl.DataFrame) -> pl.DataFrame:
-        names = [n for n in SIGNAL_COLUMNS[self.table] if n != "t_ns" and n not in MAY_BE_UNKNOWN]
-        whole = frame.filter(pl.all_horizontal(pl.col(names).is_finite().fill_null(True)))
-        self.not_finite += len(frame) - len(whole)
-        return whole
-
-    def _one_a_stamp(self, frame: pl.DataFrame) -> pl.DataFrame:
-        """Of the sorted rows the first of every stamp; the others are counted as copies or contradictions."""
-        t = frame["t_ns"].to_numpy()
-        first = np.r_[True, t[1:] != t[:-1]]
-        if not first.all():
-            leaders = np.flatnonzero(first)[np.cumsum(first) - 1]
-            others = np.flatnonzero(~first)
-            names = SIGNAL_COLUMNS[self.table]
-            one, other = frame[leaders[others]], frame[others]
-            same = np.logical_and.reduce([other[n].eq_missing(one[n]).to_numpy() for n in names])
-            self.duplicates += int(np.count_nonzero(same))
-            self.conflicts += int(np.count_nonzero(~same))
-            frame = frame.filter(pl.Series(first))
-        behind = frame["behind"].to_numpy()
-        self.reset += int(np.count_nonzero(behind > CLOCK_RESET_NS))
-        self.largest_step_back_ns = max(self.largest_step_back_ns, int(behind.max()))
-        self._account(frame["t_ns"].to_numpy())
-        run = frame["run"].to_numpy()
-        switches = run[1:] != run[:-1]
-        self._switches += int(np.count_nonzero(switches)) + (self._last_run not in (None, int(run[0])))
-        self._runs |= set(np.unique(run).tolist())
-        self._last_run = int(run[-1])
-        return frame.drop("behind", "run")
-
-    def clock_was_reset(self) -> bool:
-        """Whether stretches recorded one after the other claim the same time, beyond a few stragglers."""
-        interleaved = self._switches > len(self._runs) - 1
-        return interleaved and self.reset > MOST_STRAGGLERS * self.rows
-
-    def _account(self, t: np.ndarray) -> None:
-        intervals = np.diff(t if self.last_ns is None else np.r_[self.last_ns, t])[:: self._keep_every]
-        self._intervals = np.concatenate([self._intervals, intervals])
-        while self._intervals.size > MOST_INTERVALS:
-            self._intervals, self._keep_every = self._intervals[::2], self._keep_every * 2
-        self.first_ns = int(t[0]) if self.first_ns is None else self.first_ns
-        self.last_ns = int(t[-1])
-        self.rows += len(t)
-
-    def findings(self, name: str) -> Iterator[Finding]:
-        """What was met, as findings on the log called `name`."""
-        table, sensors = self.table, self.table in SENSOR_TABLES
-        if self.clock_was_reset():
-            yield Finding(
-                "clock_reset",
-                self.reset,
-                f"{name}: the stamps of {table} step back by {self.largest_step_back_ns * 1e-9:.3f} s into time "
-                f"that is recorded already ({self.reset} rows): the clock was reset. Split the log where it was.",
-                fatal=sensors,
-            )
-        elif self.disordered:
-            yield Finding(
-                "out_of_order",
-                self.disordered,
-                f"{name}: {self.disordered} rows of {table} came after later ones and were sorted in.",
-            )
-        if self.not_finite:
-            yield Finding(
-                "not_finite",
-                self.not_finite,
-                f"{name}: {self.not_finite} rows of {table} hold NaN or infinity and were left out.",
-                loses_data=sensors,
-            )
-        if self.conflicts:
-            yield Finding(
-                "repeated_stamps",
-                self.conflicts,
-                f"{name}: {self.conflicts} rows of {table} repeat a time stamp with other values; the first of each "
-                "stamp was kept.",
-                loses_data=sensors,
-            )
-        if self.duplicates:
-            yield Finding(
-                "duplicate_rows",
-                self.duplicates,
-                f"{name}: {self.duplicates} rows of {table} stand in the log twice and were taken once.",
-            )
 
 
 class TidyLog:
@@ -198,9 +42,13 @@ class TidyLog:
         What findings call it.
     whole : bool
         Hold every row until the end: for logs that were found `Disordered`.
+    seconds : float
+        How long reading may take.
     """
 
-    def __init__(self, reader: LogReader, name: str, *, whole: bool = False) -> None:
+    def __init__(self, reader: LogReader, name: str, *, whole: bool = False, seconds: float = math.inf) -> None:
+        self._give_up = time.monotonic() + seconds
+        self._seconds = seconds
         self._reader = reader
         self._name = name
         self._held_rows = None if whole else HELD_ROWS
@@ -215,11 +63,17 @@ class TidyLog:
         Raises
         ------
         UnreadableLog
-            The log cannot be read, or nothing in it is usable.
+            The log cannot be read, nothing in it is usable, or it takes too long (`too_slow`).
         Disordered
             See `TidySignal.add`.
         """
         for table, columns in self._reader.batches():
+            if time.monotonic() > self._give_up:
+                raise UnreadableLog(
+                    TOO_SLOW,
+                    f"{self._name} was still being read after {self._seconds:.0f} s, {SECONDS_ALLOWED:.0f} s and 1 s "
+                    "for every MB are allowed. Check the disk; the next night tries again.",
+                )
             signal = self._signals.setdefault(table, TidySignal(table, self._held_rows))
             for frame in signal.add(columns):
                 yield table, self._seen(table, frame)
@@ -233,6 +87,13 @@ class TidyLog:
                 f"{self._name}: not one usable IMU sample"
                 + "".join(f" ({finding.sentence})" for finding in self._findings()[:1])
                 + ". Check the topics or columns in fieldcal.toml.",
+            )
+        if self._signals["imu"].rows < LEAST_SAMPLES:
+            raise UnreadableLog(
+                "too_few_samples",
+                f"{self._name} holds {self._signals['imu'].rows} IMU samples at different times, {LEAST_SAMPLES} are "
+                "the least."
+                + "".join(f" {finding.sentence}" for finding in self._findings()[:1]),
             )
 
     def units(self) -> dict[str, str] | None:
@@ -272,7 +133,7 @@ class TidyLog:
             "temperature_min_degc": low,
             "temperature_mean_degc": None if total is None else total / n_temperatures,
             "temperature_max_degc": high,
-            "started_at_ns": first_ns if summary.epoch_known else None,
+            "started_at_ns": first_ns if summary.epoch_known and first_ns > EPOCH_KNOWN_AFTER_NS else None,
             "position": [float(v) for v in self._position / place.rows] if place and place.rows else None,
             **verdict(findings),
         }
@@ -280,7 +141,9 @@ class TidyLog:
 
 def tidy_log(path: Path, vehicle: Vehicle, *, whole: bool = False) -> TidyLog:
     """Open a log for tidying. Raises as `open_log`."""
-    return TidyLog(open_log(path, vehicle), path.name, whole=whole)
+    reader = open_log(path, vehicle)
+    size = sum(part.stat().st_size for part in (folder_parts(path) if path.is_dir() else [path]))
+    return TidyLog(reader, path.name, whole=whole, seconds=SECONDS_ALLOWED + size / 1e6)
 
 
 def logged_units(path: Path, vehicle: Vehicle) -> dict[str, str]:

@@ -12,15 +12,16 @@ from typing import Any
 
 import polars as pl
 
-from fieldcal.results import StageResult
-from fieldcal.stages import attitude, comparison, gyroscope, joint, preparation, vector_triads, vps
+from fieldcal.results import StageResult, fatal_fault
+from fieldcal.stages import attitude, comparison, gyroscope, joint, preparation, sanity, vector_triads, vps, warm_up
 
 Run = Callable[[Mapping[str, pl.DataFrame], Mapping[str, Any]], StageResult]
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage: `reads` maps the function's own names to `stage.table`, `needs` are those it cannot do without."""
+    """One stage: `reads` maps the function's own names to `stage.table`, `needs` are those it cannot do without,
+    `trusts` the sensors that must be free of fatal faults."""
 
     name: str
     function: Run
@@ -28,6 +29,7 @@ class Stage:
     needs: tuple[str, ...]
     writes: tuple[str, ...]
     settings: tuple[str, ...]
+    trusts: tuple[str, ...] = ()
 
 
 ELLIPSOID = (
@@ -44,10 +46,19 @@ AXES = ("rotation_body_from_sensor", "body")
 SMOOTHING = ("smoothing_cutoff_hz", "smoothing_ends", "smoothing_side_s")
 VECTORS = ("attitude", "field_ned", "gravity_mps2", "gravity_sign", "nominal_scale", "polarity", "units", *AXES)
 GYRO = ("gyro_max_scale_sd", "nominal_scale", "polarity", "units", "reference_reading", *AXES)
-SAMPLES = {"samples": "smoothing.samples", "temperature": "ingest.temperature"}
+FAULTS = {"faults": "sanity.faults"}
+SAMPLES = {"samples": "smoothing.samples", "temperature": "ingest.temperature", **FAULTS}
 MAGNETOMETER = {"magnetometer": "magnetometer.calibration", "magnetometer_covariance": "magnetometer.covariance"}
 
 PIPELINE: tuple[Stage, ...] = (
+    Stage(
+        "sanity",
+        sanity.check_sensors,
+        {"imu": "ingest.imu", "magnetometer": "ingest.magnetometer"},
+        (),
+        ("faults",),
+        ("units", "nominal_scale", "field_ned", "field_unit", "gravity_mps2"),
+    ),
     Stage(
         "manoeuvre",
         preparation.find_manoeuvre,
@@ -78,6 +89,7 @@ PIPELINE: tuple[Stage, ...] = (
         ("samples", "segments"),
         ("calibration", "covariance"),
         (*ELLIPSOID, "field_ned", "field_unit"),
+        ("magnetometer",),
     ),
     Stage(
         "accelerometer",
@@ -86,14 +98,16 @@ PIPELINE: tuple[Stage, ...] = (
         ("samples",),
         ("calibration", "covariance"),
         (*ELLIPSOID, "gravity_mps2"),
+        ("accelerometer",),
     ),
     Stage(
         "attitude",
         attitude.estimate_attitude,
         {**SAMPLES, **MAGNETOMETER, "accelerometer": "accelerometer.calibration"},
         ("samples",),
-        ("attitude",),
+        ("attitude", "faults"),
         (*VECTORS, "field_source"),
+        attitude.VECTOR_SENSORS,
     ),
     Stage(
         "gyro_equation",
@@ -102,6 +116,7 @@ PIPELINE: tuple[Stage, ...] = (
         ("samples", "attitude"),
         ("calibration", "covariance"),
         (*GYRO, "equations", "differentiation_window_s"),
+        ("gyroscope",),
     ),
     # Second pass, now with rates: lever arm (Eq. 3) and sample gate.
     Stage(
@@ -124,14 +139,28 @@ PIPELINE: tuple[Stage, ...] = (
             "gate_rate_radps",
             "differentiation_window_s",
         ),
+        ("accelerometer",),
     ),
     Stage(
         "attitude_pass2",
         attitude.estimate_attitude,
         {**SAMPLES, **MAGNETOMETER, "accelerometer": "accelerometer_pass2.calibration"},
         ("samples",),
-        ("attitude",),
+        ("attitude", "faults"),
         (*VECTORS, "field_source"),
+        attitude.VECTOR_SENSORS,
+    ),
+    Stage(
+        "vectors",
+        vector_triads.judge_vectors,
+        {
+            "magnetometer": "magnetometer.calibration",
+            "accelerometer": "accelerometer_pass2.calibration",
+            "faults": "attitude_pass2.faults",
+        },
+        (),
+        ("calibration",),
+        (),
     ),
     Stage(
         "gyro_equation_pass2",
@@ -140,6 +169,7 @@ PIPELINE: tuple[Stage, ...] = (
         ("samples", "attitude"),
         ("calibration", "covariance"),
         (*GYRO, "equations", "differentiation_window_s"),
+        ("gyroscope",),
     ),
     Stage(
         "gyro_output",
@@ -155,6 +185,16 @@ PIPELINE: tuple[Stage, ...] = (
         ("samples", "attitude", "gyroscope"),
         ("calibration", "covariance"),
         (*GYRO, *VECTORS, "gyro_output", "initial_attitude", "shooting_s"),
+        ("gyroscope",),
+    ),
+    Stage(
+        "warm_up",
+        warm_up.find_warm_up,
+        {"imu": "ingest.imu", "temperature": "ingest.temperature", **FAULTS},
+        ("imu",),
+        ("calibration",),
+        ("units", "manoeuvre_max_gap_s"),
+        ("gyroscope",),
     ),
     Stage(
         "joint",
@@ -185,6 +225,7 @@ PIPELINE: tuple[Stage, ...] = (
             "ellipsoid_max_residual",
             "gyro_max_scale_sd",
         ),
+        ("gyroscope",),
     ),
     Stage(
         "vps_sync",
@@ -196,10 +237,12 @@ PIPELINE: tuple[Stage, ...] = (
             "gyroscope": "gyro_output.calibration",
             "joint": "joint.calibration",
             "joint_attitude": "joint.attitude",
+            **FAULTS,
         },
         ("imu",),
         ("sync", "vps_aligned"),
         (*AXES, "world", "polarity", "nominal_scale", "vps_max_lag_s", "vps_min_peak", "vps_max_gap_s"),
+        ("gyroscope",),
     ),
     Stage(
         "verify",
@@ -224,10 +267,10 @@ PIPELINE: tuple[Stage, ...] = (
 # Which stage's table is the flight's word, for each published table.
 PUBLISHED: dict[str, tuple[str, ...]] = {
     "calibration": (
-        "magnetometer.calibration",
-        "accelerometer_pass2.calibration",
+        "vectors.calibration",
         "gyro_output.calibration",  # equation error's rows too
         "joint.calibration",
+        "warm_up.calibration",
     ),
     "fit": ("verify.fit",),
     "sync": ("vps_sync.sync",),
@@ -237,6 +280,15 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
 def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: Mapping[str, Any]) -> StageResult:
     """Run one stage on `stage.table` tables; missing needs end as a refusal that names them."""
     inputs = {own: tables[name] for own, name in stage.reads.items() if name in tables}
+    if stage.trusts and "faults" in inputs:
+        fault = fatal_fault(inputs["faults"], stage.trusts)
+        if fault is not None:
+            return StageResult(
+                status="refused",
+                reason_code=str(fault["reason_code"]),
+                reason=str(fault["reason"]),
+                measured={"number": fault["number"], "limit": fault["limit"]},
+            )
     for need in stage.needs:
         if need not in inputs:
             source = stage.reads[need].split(".")[0]

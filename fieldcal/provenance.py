@@ -31,7 +31,7 @@ LIBRARIES = ("numpy", "scipy", "polars")
 
 def run_key(
     stage_name: str,
-    function: Callable[..., Any],
+    source: str,
     params: Mapping[str, Any],
     input_hashes: Mapping[str, str],
     *,
@@ -43,8 +43,8 @@ def run_key(
     ----------
     stage_name : str
         Name of the stage.
-    function : callable
-        What the stage runs.
+    source : str
+        `source_digest` of what the stage runs, taken when that was imported: a file edited since is not what runs.
     params : mapping
         Parameters that change results; plain JSON without NaN.
     input_hashes : mapping
@@ -61,7 +61,7 @@ def run_key(
         "stage": stage_name,
         "params": dict(params),
         "inputs": dict(input_hashes),
-        "source": source_digest(function),
+        "source": source,
         "versions": library_versions(),
         "extra": dict(extra or {}),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from fieldcal.frames import AXES
 from fieldcal.rotation import Array
+from fieldcal.sensor_sanity import Fault
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,29 @@ class StageResult:
     reason_code: str | None = None
     reason: str | None = None
     measured: dict[str, Any] = field(default_factory=dict)
+
+
+FAULT_SCHEMA = {
+    "sensor": pl.String,
+    "axis": pl.String,
+    "reason_code": pl.String,
+    "number": pl.Float64,
+    "limit": pl.Float64,
+    "fatal": pl.Boolean,
+    "reason": pl.String,
+}
+
+
+def fault_rows(faults: Sequence[Fault]) -> pl.DataFrame:
+    """Faults as the table `faults`."""
+    rows = [(f.sensor, f.axis, f.code, f.value, f.limit, f.fatal, f.sentence) for f in faults]
+    return pl.DataFrame(rows, schema=FAULT_SCHEMA, orient="row")
+
+
+def fatal_fault(faults: pl.DataFrame, sensors: tuple[str, ...]) -> dict[str, Any] | None:
+    """The first fatal row of `faults` that concerns one of `sensors`, or None."""
+    found = faults.filter(pl.col("fatal") & pl.col("sensor").is_in(list(sensors)))
+    return found.row(0, named=True) if found.height else None
 
 
 def triad_rows(

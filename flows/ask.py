@@ -38,7 +38,7 @@ def calibration_history(
         if wanted is not None:
             rows = rows.filter(pl.col(column) == wanted)
     if since is not None:
-        rows = rows.filter(pl.col("started_at") >= _moment(since))
+        rows = rows.filter(pl.col("started_at") >= moment_of("--since", since))
     order = ["started_at", "vehicle_id", "flight_id", "sensor", "method", "parameter", "axis"]
     return rows.select(COLUMNS).sort(order, nulls_last=True).collect()
 
@@ -63,9 +63,16 @@ def existing(root: Path) -> Warehouse:
     return Warehouse(root)
 
 
-def _moment(text: str) -> datetime:
+def moment_of(option: str, text: str) -> datetime:
+    """The moment that an option of the command line names; UTC where it has no zone.
+
+    Raises
+    ------
+    FieldcalError
+        `wrong_option`.
+    """
     try:
         moment = datetime.fromisoformat(text)
     except ValueError as error:
-        raise FieldcalError("wrong_option", f'--since needs a date such as 2026-05-04, not "{text}".') from error
+        raise FieldcalError("wrong_option", f'{option} needs a date such as 2026-05-04, not "{text}".') from error
     return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,26 @@ from flows.jobs import CONFIG_NAME, Job, configuration_of, find_source, with_par
 from flows.rows import flight_row, judged, lead, published_tables, rows_frame, run_rows
 from flows.show import rows_of, unfolded
 from flows.steps import INGEST, plain, sentence
+from flows.threads import one_thread
 from flows.versions import versions
 
 
-def calibrate_log(
+@dataclass(frozen=True)
+class CalibratedLog:
+    """One log's results: `document` as `calibrate_log` returns it, every `stage.table`, and the stages' settings."""
+
+    document: dict[str, Any]
+    tables: dict[str, pl.DataFrame]
+    settings: dict[str, Any]
+
+
+def calibrate_log(log: Path, config: Path | None = None, **choices: Any) -> dict[str, Any]:
+    """Calibrate one log; its flight, calibration, fit, sync and run, named as the columns of those tables. Arguments
+    and errors as in `run_log`."""
+    return run_log(log, config, **choices).document
+
+
+def run_log(
     log: Path,
     config: Path | None = None,
     *,
@@ -30,8 +46,8 @@ def calibrate_log(
     profile: str | None = None,
     method: str | None = None,
     changes: dict[str, str] | None = None,
-) -> dict[str, Any]:
-    """Calibrate one log; its flight, calibration, fit, sync and run, named as the columns of those tables.
+) -> CalibratedLog:
+    """Calibrate one log; what it says, and all tables on the way.
 
     Vehicle and session are taken from the folders the log lies in, `<vehicle>/<session>/<log>`, unless given; the
     configuration from `fieldcal.toml` above them, unless given. `profile`, `method` and `changes` overrule its own.
@@ -53,12 +69,14 @@ def calibrate_log(
         vehicle = replace(vehicle, method=method)
     signals, facts = ingest.read_flight(log, vehicle)
     records: dict[str, dict[str, Any]] = {INGEST: _record(_ingest_result(facts))}
+    settings: dict[str, Any] = {}
     tables: dict[str, pl.DataFrame] = {f"{INGEST}.{name}": frame for name, frame in signals.items()}
     if facts["verdict"] in ("ok", "partial"):
         settings = ingest.settings_of(facts, vehicle)
         for stage in PIPELINE:
             try:
-                result = run_stage(stage, tables, settings)
+                with one_thread():
+                    result = run_stage(stage, tables, settings)
             except Exception as error:
                 why = f"{stage.name}: {sentence(job, error)}"
                 result = StageResult(status="failed", reason_code="stage_failed", reason=why)
@@ -68,13 +86,14 @@ def calibrate_log(
     leading = lead(job, vehicle.imu_id, facts)
     published = published_tables(leading, {name: (frame, None) for name, frame in tables.items()})
     sync = rows_of(published["sync"])
-    return {
+    document = {
         "flight": unfolded(rows_of(rows_frame("flight", [flight_row(job, leading, facts)]))[0]),
         "calibration": rows_of(published["calibration"]),
         "fit": rows_of(published["fit"]),
         "sync": sync[0] if sync else None,
         "run": [unfolded(row) for row in rows_of(rows_frame("run", run_rows(leading, records)))],
     }
+    return CalibratedLog(document, tables, settings)
 
 
 def _configuration(config: Path | None, archive: Path) -> Configuration:

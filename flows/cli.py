@@ -11,6 +11,10 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 import fieldcal
+from flows.cli_drift import drift
+from flows.cli_fly import apply, export
+from flows.cli_report import report as report_command
+from flows.cli_serve import serve, trigger
 from flows.cli_simulate import simulate
 from flows.interrupt import interruptible
 
@@ -23,6 +27,7 @@ app = App(
     version=fieldcal.__version__,
     result_action="return_value",
     help_format="plaintext",
+    suppress_keyboard_interrupt=False,
     default_parameter=Parameter(negative=""),
 )
 
@@ -34,6 +39,11 @@ AsJson = Annotated[bool, Parameter(name="--json", help="One JSON document on std
 AsCsv = Annotated[bool, Parameter(name="--csv", help="CSV on stdout.")]
 DryRun = Annotated[bool, Parameter(help="List what would run; change nothing.")]
 Workers = Annotated[int, Parameter(help="Processes that calibrate; results do not depend on it.")]
+Runner = Annotated[
+    Literal["process", "dask", "pool"],
+    Parameter(help="Where they run: on this machine, on a Dask cluster, or in the work pool of prefect.yaml."),
+]
+Scheduler = Annotated[str | None, Parameter(help="Address of the Dask scheduler; else a cluster on this machine.")]
 
 
 @app.command
@@ -59,6 +69,7 @@ def calibrate(
     method: Literal["serial", "joint"] | None = None,
     profile: Literal["full", "onboard", "paper"] | None = None,
     set_: Annotated[list[str] | None, Parameter(name="--set")] = None,
+    report: Annotated[Path | None, Parameter(help="Write the flight's report to this HTML file too.")] = None,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -78,11 +89,16 @@ def calibrate(
     set_
         Overrule a stage parameter: --set smoothing_cutoff_hz=6.
     """
-    from flows.calibrate import calibrate_log
-    from flows.show import console, print_json
+    from flows.calibrate import run_log
+    from flows.show import console, print_json, say
 
     changes = _assignments(set_ or [])
-    document = calibrate_log(log, config, vehicle_id=vehicle, profile=profile, method=method, changes=changes)
+    result = run_log(log, config, vehicle_id=vehicle, profile=profile, method=method, changes=changes)
+    document = result.document
+    if report is not None:
+        from flows.report import log_report
+
+        say(f"Report: {log_report(result, report)}")
     if as_json:
         print_json(document)
     else:
@@ -98,6 +114,8 @@ def nightly(
     /,
     *,
     workers: Workers = 1,
+    runner: Runner = "process",
+    scheduler: Scheduler = None,
     dry_run: DryRun = False,
     as_json: AsJson = False,
     warehouse: Root = None,
@@ -111,7 +129,8 @@ def nightly(
         Folder of logs: ARCHIVE/<vehicle>/<session>/<log>.
     """
     _need_folder(archive, "no_archive", "archive")
-    return _night(archive.absolute(), None, workers, dry_run, as_json, warehouse, config)
+    where = {"runner": runner, "scheduler": scheduler}
+    return _night(archive.absolute(), None, workers, where, dry_run, as_json, warehouse, config)
 
 
 @app.command
@@ -120,6 +139,8 @@ def session(
     /,
     *,
     workers: Workers = 1,
+    runner: Runner = "process",
+    scheduler: Scheduler = None,
     dry_run: DryRun = False,
     as_json: AsJson = False,
     warehouse: Root = None,
@@ -134,7 +155,8 @@ def session(
     """
     _need_folder(folder, "no_session", "session folder")
     own = folder.absolute()
-    return _night(own.parent.parent, own, workers, dry_run, as_json, warehouse, config)
+    where = {"runner": runner, "scheduler": scheduler}
+    return _night(own.parent.parent, own, workers, where, dry_run, as_json, warehouse, config)
 
 
 @app.command
@@ -219,6 +241,34 @@ def verify(
     return OK if result["ok"] else FAILED
 
 
+@app.command
+def doctor(
+    *,
+    archive: Path | None = None,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Check versions, disk, permissions, locks and server, and say what to do.
+
+    Parameters
+    ----------
+    archive
+        Check that the logs of this archive can be read too.
+    """
+    from flows.doctor import examine
+    from flows.show import print_json
+
+    result = examine(_root(warehouse), archive)
+    if as_json:
+        print_json(result)
+    else:
+        for check in result["checks"]:
+            advice = f"\n{'':23}{check['advice']}" if check["advice"] else ""
+            print(f"{check['status']:8} {check['check']:14}{check['found']}{advice}")
+    return OK if result["ok"] else FAILED
+
+
 def main(tokens: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
     sys.exit(run(sys.argv[1:] if tokens is None else tokens))
@@ -267,6 +317,7 @@ def _night(
     archive: Path,
     folder: Path | None,
     workers: int,
+    where: dict[str, str | None],
     dry: bool,
     as_json: bool,
     warehouse: Path | None,
@@ -291,7 +342,7 @@ def _night(
     from flows.present_night import NightProgress, print_night
 
     with NightProgress() as progress:
-        result = run_night(archive, root, config, folder, workers, progress)
+        result = run_night(archive, root, config, folder, workers, progress, **where)
     if as_json:
         print_json(result)
     else:
@@ -325,7 +376,13 @@ def _assignments(texts: list[str]) -> dict[str, str]:
     return {name.strip(): value.strip() for name, _, value in pairs}
 
 
+app.command(report_command, name="report")
+app.command(serve)
+app.command(trigger)
 app.command(simulate)
+app.command(drift)
+app.command(export)
+app.command(apply)
 
 if __name__ == "__main__":
     main()

@@ -9,8 +9,15 @@ from typing import Any
 from fieldcal.configuration import Configuration
 from flows.jobs import Job, Source, configuration_of
 from flows.outcome import Outcome, failed_outcome
-from flows.steps import STEPS, FlightWork, Record, sentence
+from flows.steps import STEPS, FlightWork, Record, code_digest, sentence
+from flows.threads import one_thread
 from warehouse.errors import WarehouseError
+
+OTHER_CODE = [
+    "code_changed",
+    "fieldcal's own source is not the same in all processes of this night: it was edited or installed anew while the "
+    "night ran, or the workers have another version. Nothing is lost; run it again.",
+]
 
 Step = Callable[[FlightWork, str], tuple[Record, bool]]
 """Make sure that a step's result is there; its record, and whether it had to run."""
@@ -43,25 +50,32 @@ def one_flight(root: Path, job: Job, settings: Configuration, do: Step = one_ste
         except Exception as error:
             return failed_outcome(job, work.records, step, sentence(job, error))
         (ran if did_run else cached).append(step)
-    return Outcome(job, work.records, tuple(ran), tuple(cached))
+    return Outcome(job, work.records, tuple(ran), tuple(cached), work.why, work.work_s)
 
 
 def flights(
     root: str,
     source: Source,
     jobs: list[dict[str, Any]],
+    code: str,
     do: Step = one_step,
     tell: Callable[[Outcome], None] | None = None,
 ) -> dict[str, Any]:
-    """A batch of flights in this process: `outcomes`, plain JSON, and `error`: why the warehouse cannot be written."""
-    settings = configuration_of(source)
+    """A batch of flights in this process: `outcomes`, plain JSON, and `error`: what concerns every log of the night.
+
+    `code` is the `code_digest` of the process that planned the night; a process with other code does nothing.
+    """
     outcomes: list[dict[str, Any]] = []
+    if code_digest() != code:
+        return {"outcomes": outcomes, "error": OTHER_CODE}
+    settings = configuration_of(source)
     try:
-        for job in jobs:
-            outcome = one_flight(Path(root), Job(**job), settings, do)
-            outcomes.append(outcome.plain())
-            if tell is not None:
-                tell(outcome)
+        with one_thread():
+            for job in jobs:
+                outcome = one_flight(Path(root), Job(**job), settings, do)
+                outcomes.append(outcome.plain())
+                if tell is not None:
+                    tell(outcome)
     except WarehouseError as error:
         return {"outcomes": outcomes, "error": [error.reason_code, error.sentence]}
     return {"outcomes": outcomes, "error": None}

@@ -63,26 +63,36 @@ def configuration_of(source: Source) -> Configuration:
     return parse(source["text"] or "", Path(source["path"]) if source["path"] else None)
 
 
-def find_jobs(archive: Path, configuration: Configuration, session: Path | None = None) -> list[Job]:
-    """All logs of an archive, or of one session folder of it, hashed, in the order of their place."""
+Ledger = Mapping[str, tuple[tuple[int, ...], str]]
+"""Path of a log → the stamp of its files when they were hashed, sha256."""
+
+
+def find_jobs(
+    archive: Path, configuration: Configuration, session: Path | None = None, ledger: Ledger | None = None
+) -> list[Job]:
+    """All logs of an archive, or of one session folder of it, in the order of their place.
+
+    Each is hashed, unless the `ledger` knows it as it is.
+    """
     logs: Iterable[LogFile] = find_logs(archive, configuration.logs)
     if session is not None:
         inside = session.resolve()
         logs = (log for log in logs if log.path.resolve().is_relative_to(inside))
-    return [_job(log) for log in logs]
+    return [_job(log, ledger or {}) for log in logs]
 
 
 def file_stamp(path: Path) -> tuple[int, ...]:
-    """Sizes and times of change of a log's files: differs when somebody still writes it."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    return tuple(value for file in files for value in (file.stat().st_size, file.stat().st_mtime_ns))
+    """Size, times of change and inode of a log's files: differs when somebody wrote to it."""
+    stats = [file.stat() for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
+    return tuple(value for stat in stats for value in (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino))
 
 
-def _job(log: LogFile) -> Job:
+def _job(log: LogFile, ledger: Ledger) -> Job:
     known = (str(log.path), log.log_uri, log.vehicle_id, log.session_id, log.log_format)
     try:
         stamp = file_stamp(log.path)
-        sha256 = log_sha256(log.path)
+        remembered = ledger.get(str(log.path))
+        sha256 = remembered[1] if remembered and remembered[0] == stamp else log_sha256(log.path)
     except OSError as error:
         stand_in = flight_id(hashlib.sha256(f"unreadable\0{log.log_uri}".encode()).hexdigest())
         why = f"{log.log_uri} cannot be read ({error.strerror}). Check its permissions."

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from flows.jobs import configuration_of, find_source
 from flows.server import running_server
-from warehouse.files import remove_abandoned
 from warehouse.layout import prepare
 
 if TYPE_CHECKING:
@@ -16,27 +15,36 @@ if TYPE_CHECKING:
 
 
 def run_night(
-    archive: Path, root: Path, config: Path | None, session: Path | None, workers: int, progress: Watcher | None = None
+    archive: Path,
+    root: Path,
+    config: Path | None = None,
+    session: Path | None = None,
+    workers: int = 1,
+    progress: Watcher | None = None,
+    **where: str | None,
 ) -> dict[str, Any]:
-    """Run the flow `nightly`; its JSON, `seconds` included."""
+    """Run the flow `nightly`, or `session` for that folder of the archive; its JSON, with how long it took.
+
+    `where` may hold `runner` and `scheduler` (`flows.runners`). `seconds` is the whole duration, `server_seconds` what
+    of it the command waited for Prefect's server, `stage_seconds` the stages' own work, summed over the workers.
+    """
     began = time.monotonic()
     find_source(config, archive)
     prepare(root)
     with running_server(root) as server:
+        from flows.housekeeping import tidy_prefect
         from flows.nightly import run_nightly
 
-        remove_abandoned(root)
-        result = run_nightly(
-            server.wait(),
-            progress,
-            archive=str(archive),
-            warehouse=str(root),
-            config=str(config) if config else None,
-            session=str(session) if session else None,
-            workers=workers,
-        )
-    counts = {name: value for name, value in result.items() if name != "logs"}
-    return {**counts, "seconds": round(time.monotonic() - began, 3), "logs": result["logs"]}
+        waiting = time.monotonic()
+        url = server.wait()
+        ready = time.monotonic()
+        tidy_prefect(root, url, own_server=server.own)
+        what = {"archive": str(archive)} if session is None else {"folder": str(session)}
+        named = {"warehouse": str(root), "config": str(config) if config else None, "workers": workers, **where}
+        result = run_nightly(url, progress, **what, **named)
+    logs = result.pop("logs")
+    times = {"seconds": round(time.monotonic() - began, 3), "server_seconds": round(ready - waiting, 3)}
+    return {**result, **times, "logs": logs}
 
 
 def dry_run(archive: Path, root: Path, config: Path | None, session: Path | None) -> dict[str, Any]:
@@ -48,7 +56,7 @@ def dry_run(archive: Path, root: Path, config: Path | None, session: Path | None
         {
             "log_uri": job.log_uri,
             "flight_id": job.flight_id,
-            "would_run": plan.missing.get(job.flight_id, []),
+            "would_run": plan.missing.get(job.flight_id, {}),
             "copy_of": plan.copies.get(job.log_uri),
         }
         for job in sorted([*plan.jobs, *plan.copied], key=lambda job: job.log_uri)

@@ -1,4 +1,4 @@
-"""The night as a Prefect flow: plan → batches of flights (each step a task) → publish, one vehicle at a time.
+"""The night, and one session, as Prefect flows: plan → batches of flights (each step a task) → publish each vehicle.
 
 What travels between tasks are small plain-JSON records. A step whose result is in the warehouse, whole, ends in the
 state `Cached` with its run_key as cache key: the warehouse is the only cache, so Prefect keeps no results of its own (a
@@ -18,26 +18,29 @@ from typing import Any
 import polars as pl
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
-from prefect.client.schemas.objects import StateDetails
+from prefect.client.schemas.objects import State, StateDetails
 from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.states import Completed
-from prefect.task_runners import ProcessPoolTaskRunner, TaskRunner
 
 from fieldcal.configuration import Configuration
+from flows.alive import alive
+from flows.artifact import keep_artifact
+from flows.closing import close_night, tell_prefect
 from flows.flights import flights, lost, one_step
 from flows.history import publish_vehicle, withdraw
-from flows.jobs import Job, Source, configuration_of, find_source
+from flows.jobs import Source, configuration_of, find_source
+from flows.log_ledger import write_ledger
 from flows.outcome import Outcome, summary
 from flows.plan import Plan, make_plan
+from flows.pool import hand_over
+from flows.runners import Parallel, answers, batches
 from flows.show import say
-from flows.steps import FlightWork, Record
+from flows.steps import FlightWork, Record, code_digest
 from flows.watching import Watcher, tell_done, tell_plan, watch
 from warehouse import Warehouse
 from warehouse.errors import WarehouseError
-
-LARGEST_BATCH = 40
-BATCHES_PER_WORKER = 4
-Batch = tuple[int, str, Source, list[dict[str, Any]]]
+from warehouse.files import remove_abandoned
+from warehouse.layout import prepare
 
 
 @dataclass(frozen=True)
@@ -56,21 +59,28 @@ _to_publish: dict[str, Publishing] = {}
 
 
 @task(name="step", task_run_name="{step} {log_uri}", cache_policy=NO_CACHE, persist_result=False)
-def run_step(flight_id: str, step: str, log_uri: str) -> Any:
-    """One step of a flight that is at work in this process: its record, and whether it ran."""
-    record, ran = one_step(_at_work[flight_id], step)
-    if ran:
-        return record, True
+def run_step(flight_id: str, step: str, log_uri: str) -> State[Any]:
+    """One step of a flight that is at work in this process, which keeps its record; the state says what was done."""
+    work = _at_work[flight_id]
+    record, ran = one_step(work, step)
+    reference = {"stage": step, "flight_id": flight_id, "run_key": record["run_key"]}
     details = StateDetails(cache_key=record["run_key"])
-    return Completed(
-        name="Cached", message="The result is there and whole.", data=(record, False), state_details=details
-    )
+    if ran:
+        return Completed(message=f"Run: {work.why.get(step)}.", data=reference, state_details=details)
+    return Completed(name="Cached", message="The result is there and whole.", data=reference, state_details=details)
 
 
 @task(name="batch", task_run_name="batch {number}", cache_policy=NO_CACHE, persist_result=False)
-def run_batch(number: int, root: str, source: Source, jobs: list[dict[str, Any]]) -> dict[str, Any]:
+def run_batch(number: int, root: str, source: Source, jobs: list[dict[str, Any]], code: str) -> dict[str, Any]:
     """A batch of flights, every step a task (`flows.flights.flights`)."""
-    return flights(root, source, jobs, _as_task, tell_done)
+    return flights(root, source, jobs, code, _as_task, tell_done)
+
+
+@flow(name="batch", persist_result=False, validate_parameters=False)
+def batch(number: int, root: str, source: Source, jobs: list[dict[str, Any]], code: str, handed_over: str) -> None:
+    """A batch in a flow run of its own, in a work pool; its answer is handed over as a file of the warehouse."""
+    with alive(Path(root)):
+        hand_over(Path(root), handed_over, run_batch(number, root, source, jobs, code))
 
 
 @task(name="publish", task_run_name="publish {vehicle_id}", cache_policy=NO_CACHE, persist_result=False)
@@ -86,49 +96,89 @@ def run_publish(vehicle_id: str) -> list[str]:
 
 @flow(name="nightly", persist_result=False, validate_parameters=False)
 def nightly(
-    archive: str, warehouse: str, config: str | None = None, session: str | None = None, workers: int = 1
+    archive: str,
+    warehouse: str,
+    config: str | None = None,
+    workers: int = 1,
+    runner: str = "process",
+    scheduler: str | None = None,
 ) -> dict[str, Any]:
-    """Calibrate every log of `archive` (or of the one folder `session` of it) that is new or changed, and publish.
+    """Calibrate every log of `archive` that is new or changed, and publish.
 
-    Returns the JSON of the night (`flows.outcome.summary`).
+    Parameters
+    ----------
+    archive, warehouse, config
+        Folder of logs, data root, `fieldcal.toml` if not the archive's own.
+    workers, runner, scheduler
+        Where the batches of flights run (`flows.runners.task_runner`); results do not depend on it.
+
+    Returns
+    -------
+    dict
+        The JSON of the night (`flows.outcome.summary`).
 
     Raises
     ------
     ConfigurationError, WarehouseError
         What concerns every log.
     """
-    root, place = Path(warehouse), Path(archive)
-    source = find_source(Path(config) if config else None, place)
-    settings = configuration_of(source)
-    plan = make_plan(root, place, settings, Path(session) if session else None)
-    tell_plan(len(plan.jobs), len(plan.missing))
-    outcomes = [*_from_cache(plan), *_calibrate(root, plan, source, workers)]
-    _publish(root, settings, outcomes)
-    return summary(outcomes, plan.copies, plan.copied, root)
+    return _night(Path(archive), Path(warehouse), config, None, Parallel(workers, runner, scheduler))
+
+
+@flow(name="session", persist_result=False, validate_parameters=False)
+def session(
+    folder: str,
+    warehouse: str,
+    config: str | None = None,
+    workers: int = 1,
+    runner: str = "process",
+    scheduler: str | None = None,
+) -> dict[str, Any]:
+    """The same for the one session folder `<archive>/<vehicle>/<session>`."""
+    own = Path(folder)
+    return _night(own.parent.parent, Path(warehouse), config, own, Parallel(workers, runner, scheduler))
 
 
 def run_nightly(api_url: str, watcher: Watcher | None = None, **parameters: Any) -> dict[str, Any]:
-    """Run the flow in this process against the server at `api_url`; `watcher` hears of every flight as it is done."""
-    workers = parameters.get("workers", 1)
-    runner: TaskRunner[Any] = ProcessPoolTaskRunner(max_workers=workers)
+    """Run one of the flows in this process against the server at `api_url`; `watcher` hears of every flight.
+
+    `parameters` are those of `session` when they name a `folder`, else those of `nightly`.
+    """
     watch(watcher)
-    night = nightly if workers == 1 else nightly.with_options(task_runner=runner)
+    chosen: Any = session if "folder" in parameters else nightly
     with temporary_settings({PREFECT_API_URL: api_url}):
-        result: dict[str, Any] = night(**parameters)
+        result: dict[str, Any] = chosen(**parameters)
     return result
 
 
-def batches(jobs: list[Job], workers: int) -> list[list[Job]]:
-    """Jobs dealt out in batches: several for every worker, none too large."""
-    size = max(1, min(LARGEST_BATCH, -(-len(jobs) // (workers * BATCHES_PER_WORKER))))
-    return [jobs[i : i + size] for i in range(0, len(jobs), size)]
+def _night(root_of_logs: Path, root: Path, config: str | None, only: Path | None, parallel: Parallel) -> dict[str, Any]:
+    source = find_source(Path(config) if config else None, root_of_logs)
+    settings = configuration_of(source)
+    prepare(root)
+    remove_abandoned(root)
+    with alive(root):
+        plan = make_plan(root, root_of_logs, settings, only)
+        write_ledger(root, [*plan.jobs, *plan.copied])
+        tell_plan(len(plan.jobs), len(plan.missing))
+        outcomes = [*_from_cache(plan), *_calibrate(root, plan, source, parallel)]
+        _publish(root, settings, outcomes)
+        closing = close_night(root)
+        told = [change.row() for change in closing.changes]
+        result = {**summary(outcomes, plan.copies, plan.copied, root), "changes": told, "report": str(closing.report)}
+        keep_artifact(result, root)
+        tell_prefect(closing.changes)
+        return result
 
 
 def _as_task(work: FlightWork, step: str) -> tuple[Record, bool]:
+    """One step as a Prefect task; where Prefect itself fails, without it."""
     _at_work[work.job.flight_id] = work
     try:
-        record, ran = run_step(work.job.flight_id, step, work.job.log_uri, return_state=True).result()
-        return record, ran
+        state = run_step(work.job.flight_id, step, work.job.log_uri, return_state=True)
+        if step in work.records:
+            return work.records[step], state.name != "Cached"
+        state.result()
+        return one_step(work, step)
     except WarehouseError:
         raise
     except Exception:
@@ -146,24 +196,22 @@ def _from_cache(plan: Plan) -> Iterator[Outcome]:
             yield outcome
 
 
-def _calibrate(root: Path, plan: Plan, source: Source, workers: int) -> Iterator[Outcome]:
+def _calibrate(root: Path, plan: Plan, source: Source, parallel: Parallel) -> Iterator[Outcome]:
     """Outcomes of the flights with something missing, batch by batch."""
     missing = [job for job in plan.jobs if job.flight_id in plan.missing]
-    inputs: list[Batch] = [
-        (number, str(root), source, [job.plain() for job in jobs])
-        for number, jobs in enumerate(batches(missing, workers) if missing else [])
+    code = code_digest()
+    inputs: list[dict[str, Any]] = [
+        {"number": n, "root": str(root), "source": source, "jobs": [job.plain() for job in jobs], "code": code}
+        for n, jobs in enumerate(batches(missing, parallel.workers))
     ]
-    if workers == 1 or len(inputs) == 1:
-        for batch in inputs:
-            yield from _outcomes(run_batch(*batch))
+    if parallel.in_this_process(len(inputs)):
+        for given in inputs:
+            yield from _outcomes(run_batch(**given))
         return
-    futures = [run_batch.submit(*batch) for batch in inputs]
-    for batch, future in zip(inputs, futures, strict=True):
-        try:
-            answer = future.result()
-        except Exception as error:
-            say(f"Batch {batch[0]} was lost ({type(error).__name__}: {error}); its logs follow one by one.")
-            answer = _one_by_one(batch)
+    for given, answer in answers(parallel, run_batch, inputs):
+        if isinstance(answer, Exception):
+            say(f"Batch {given['number']} was lost ({type(answer).__name__}: {answer}); its logs follow one by one.")
+            answer = _one_by_one(given)
         for outcome in _outcomes(answer):
             tell_done(outcome)
             yield outcome
@@ -175,14 +223,13 @@ def _outcomes(answer: dict[str, Any]) -> Iterator[Outcome]:
         raise WarehouseError(*answer["error"])
 
 
-def _one_by_one(batch: Batch) -> dict[str, Any]:
+def _one_by_one(given: dict[str, Any]) -> dict[str, Any]:
     """The flights of a batch whose process died, each in a process of its own: only the guilty one is lost."""
-    _, root, source, jobs = batch
     outcomes: list[dict[str, Any]] = []
-    for job in jobs:
+    for job in given["jobs"]:
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
             try:
-                answer = alone.submit(flights, root, source, [job]).result()
+                answer = alone.submit(flights, given["root"], given["source"], [job], given["code"]).result()
             except BrokenProcessPool:
                 why = f"The process that calibrated {job['log_uri']} was killed, twice (out of memory?)."
                 outcomes.append(lost(job, why))

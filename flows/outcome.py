@@ -12,6 +12,7 @@ import polars as pl
 
 from fieldcal import ingest
 from flows.jobs import Job
+from flows.reasons import NO_RESULT
 from flows.rows import judged, refusals
 from flows.steps import INGEST, Record
 from flows.versions import versions
@@ -22,12 +23,17 @@ VERDICTS = ("ok", "partial", "quarantined", "rejected")
 
 @dataclass(frozen=True)
 class Outcome:
-    """One flight: the record of every step, which of them ran, and which were found in the cache."""
+    """One flight: the record of every step, which of them ran and why, and which were found in the cache.
+
+    `work_s` is the time that the steps' own work took.
+    """
 
     job: Job
     records: Mapping[str, Record]
     ran: tuple[str, ...] = ()
     cached: tuple[str, ...] = ()
+    why: Mapping[str, str] = field(default_factory=dict)
+    work_s: float = 0.0
     facts: Mapping[str, Any] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -40,12 +46,15 @@ class Outcome:
             "records": dict(self.records),
             "ran": list(self.ran),
             "cached": list(self.cached),
+            "why": dict(self.why),
+            "work_s": self.work_s,
         }
 
     @staticmethod
     def of(plain: Mapping[str, Any]) -> Outcome:
         """From its plain JSON."""
-        return Outcome(Job(**plain["job"]), plain["records"], tuple(plain["ran"]), tuple(plain["cached"]))
+        given = {**plain, "job": Job(**plain["job"]), "ran": tuple(plain["ran"]), "cached": tuple(plain["cached"])}
+        return Outcome(**given)
 
     def entry(self) -> dict[str, Any]:
         """The flight's place in the JSON of a night."""
@@ -61,7 +70,18 @@ class Outcome:
             "refusals": refusals(self.records) if len(self.records) > 1 else [],
             "stages_run": len(self.ran),
             "stages_cached": len(self.cached),
+            "ran": {step: self.why.get(step) for step in self.ran},
         }
+
+
+def cause(why: Mapping[str, str | None]) -> str:
+    """Why steps run (step → reason, in their order) in a few words: the first reason, and how many others follow."""
+    if not why:
+        return "nothing new"
+    step, reason = next(iter(why.items()))
+    if step == INGEST and reason == NO_RESULT:
+        return "new log"
+    return f"{step}: {reason or NO_RESULT}" + (f", and {len(why) - 1} more" if len(why) > 1 else "")
 
 
 def failed_outcome(job: Job, records: Mapping[str, Record], step: str, reason: str) -> Outcome:
@@ -95,6 +115,7 @@ def summary(
         **{verdict: counts[verdict] for verdict in VERDICTS},
         "stages_run": sum(len(outcome.ran) for outcome in outcomes),
         "stages_cached": sum(len(outcome.cached) for outcome in outcomes),
+        "stage_seconds": round(sum(outcome.work_s for outcome in outcomes), 3),
         "logs": logs,
     }
 
@@ -115,6 +136,7 @@ def _copy(job: Job, first: str, entries: Mapping[str, Mapping[str, Any]], root: 
         "refusals": [],
         "stages_run": 0,
         "stages_cached": 0,
+        "ran": {},
     }
 
 

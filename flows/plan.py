@@ -8,6 +8,7 @@ from typing import Any
 
 from fieldcal.configuration import Configuration
 from flows.jobs import Job, find_jobs, without_copies
+from flows.log_ledger import read_ledger
 from flows.steps import FlightWork, Record
 from warehouse import Warehouse
 
@@ -16,20 +17,20 @@ from warehouse import Warehouse
 class Plan:
     """A night before it runs.
 
-    `unchanged`: flights all of whose results are there, with their records; `missing`: flights with steps to run;
-    `copies`: log_uri → log_uri of the log it is a copy of.
+    `unchanged`: flights all of whose results are there, with their records; `missing`: flights with steps to run, each
+    with why; `copies`: log_uri → log_uri of the log it is a copy of.
     """
 
     jobs: list[Job] = field(default_factory=list)
     unchanged: dict[str, dict[str, Record]] = field(default_factory=dict)
-    missing: dict[str, list[str]] = field(default_factory=dict)
+    missing: dict[str, dict[str, str]] = field(default_factory=dict)
     copies: dict[str, str] = field(default_factory=dict)
     copied: list[Job] = field(default_factory=list)
 
 
 def make_plan(root: Path, archive: Path, configuration: Configuration, session: Path | None = None) -> Plan:
     """Find the logs and decide for each which steps must run."""
-    found = find_jobs(archive, configuration, session)
+    found = find_jobs(archive, configuration, session, read_ledger(root))
     kept, copies = without_copies(found, *_known(root, archive))
     plan = Plan(copies=copies, copied=[job for job in found if job.log_uri in copies])
     for job in kept:

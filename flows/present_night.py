@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console
 
+from flows.outcome import cause
 from flows.present_flight import is_consequence
 from flows.show import number, say, table
 from warehouse import Warehouse
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 WORST = 5
 REFUSALS = 12
+CHANGES = 20
 
 
 class NightProgress:
@@ -52,7 +54,8 @@ class NightProgress:
         elif outcome.ran:
             facts = outcome.facts
             why = f" ({facts['reason_code']})" if facts["reason_code"] else ""
-            what = f"{facts['verdict']}{why}, {len(outcome.ran)} stages run"
+            reasons = cause({step: outcome.why.get(step) for step in outcome.ran})
+            what = f"{facts['verdict']}{why}, {len(outcome.ran)} stages run ({reasons})"
             say(f"[{self._done}/{self._total}] {outcome.job.log_uri}: {what}")
 
     def __enter__(self) -> Self:
@@ -83,7 +86,13 @@ def print_night(console: Console, result: Mapping[str, Any], root: Path) -> None
     if worst:
         columns = ["log", "quantity", "method", "against", "TIC", "rms"]
         console.print(table(columns, worst, "Poorest agreement (Theil inequality coefficient, smoothed)"))
-    console.print(f"History: {root}/tables (fieldcal history, fieldcal sql)", markup=False)
+    if result["changes"]:
+        lines = [[change["kind"], change["sentence"]] for change in result["changes"]]
+        console.print(table(["new", "what"], lines[:CHANGES], "What changed in the fleet"))
+        if len(lines) > CHANGES:
+            console.print(f"  … and {len(lines) - CHANGES} more: fieldcal drift", markup=False)
+    console.print(f"History: {root}/tables (fieldcal history, drift, sql)", markup=False)
+    console.print(f"Report:  {result['report']} (fieldcal report --vehicle V, --flight ID)", markup=False)
 
 
 def _refusals(log: Mapping[str, Any]) -> list[list[str]]:
@@ -109,7 +118,7 @@ def print_plan(console: Console, plan: Mapping[str, Any]) -> None:
 def _would(log: Mapping[str, Any]) -> str:
     if log["copy_of"]:
         return f"nothing: a copy of {log['copy_of']}"
-    return "everything" if log["would_run"][0] == "ingest" else ", ".join(log["would_run"])
+    return cause(log["would_run"])
 
 
 def _worst(root: Path, flights: Sequence[str]) -> list[list[str]]:

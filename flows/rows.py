@@ -70,11 +70,14 @@ def run_rows(leading: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]
 
 
 def judged(facts: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """The facts with the verdict of the whole flight: a stage that failed makes an `ok` log `partial`."""
+    """The facts with what the stages found: a stage that failed makes an `ok` log `partial`; faults are findings too."""
+    faults = records["sanity"]["measured"].get("faults", []) if "sanity" in records else []
+    told = [{"code": fault["code"], "count": 1, "sentence": fault["sentence"]} for fault in faults]
+    facts = {**facts, "findings": [*facts["findings"], *told]}
     failed = [record for record in records.values() if record["status"] == "failed"]
     if facts["verdict"] == "ok" and failed:
         return {**facts, "verdict": "partial", "reason_code": failed[0]["reason_code"], "reason": failed[0]["reason"]}
-    return dict(facts)
+    return facts
 
 
 def refusals(records: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:

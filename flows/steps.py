@@ -6,8 +6,11 @@ history need to know: status, reason, measured numbers, versions, and the sha256
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import math
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -18,9 +21,11 @@ from fieldcal import ingest
 from fieldcal.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.pipeline import PIPELINE, Stage, run_stage
-from fieldcal.provenance import run_key
+from fieldcal.provenance import run_key, source_digest
 from fieldcal.results import StageResult
+from fieldcal.tidy import Disordered
 from flows.jobs import Job, file_stamp
+from flows.reasons import why_it_runs
 from flows.versions import versions
 from warehouse.errors import WarehouseError
 from warehouse.files import file_sha256
@@ -33,6 +38,21 @@ INGEST = "ingest"
 STEPS = (INGEST, *(stage.name for stage in PIPELINE))
 STAGES: dict[str, Stage] = {stage.name: stage for stage in PIPELINE}
 Record = dict[str, Any]
+
+
+@functools.cache
+def step_sources() -> dict[str, str]:
+    """Digest of the source of every step, taken once in a process: what runs is what was imported."""
+    functions: dict[str, Callable[..., Any]] = {
+        INGEST: ingest.tidy_log,
+        **{name: stage.function for name, stage in STAGES.items()},
+    }
+    return {step: source_digest(function) for step, function in functions.items()}
+
+
+def code_digest() -> str:
+    """One digest for the source of all steps, by which processes that share a night tell that they run the same."""
+    return hashlib.sha256(repr(sorted(step_sources().items())).encode()).hexdigest()
 
 
 class FlightWork:
@@ -51,6 +71,10 @@ class FlightWork:
     def __init__(self, root: Path, job: Job, vehicle: Vehicle) -> None:
         self.job = job
         self.records: dict[str, Record] = {}
+        self.why: dict[str, str] = {}
+        """Why each step had to run, of those that `find` did not."""
+        self.work_s = 0.0
+        """Time that the steps' own work took: reading their input, computing, writing their output."""
         self._root = root
         self._store = StageStore(root)
         self._vehicle = vehicle
@@ -68,18 +92,13 @@ class FlightWork:
 
     def key(self, step: str) -> str:
         """run_key of a step; the records of the steps before it must be known."""
-        if step == INGEST:
-            settings = self._vehicle.settings()
-            read_as = {name: settings[name] for name in ("csv", "mcap", "units")}
-            named = {"vehicle_id": self.job.vehicle_id, "name": Path(self.job.path).name}
-            return run_key(INGEST, ingest.tidy_log, {**read_as, **named}, {"log": self.job.sha256 or ""})
-        stage = STAGES[step]
-        return run_key(step, stage.function, self._params(stage), self._hashes(stage))
+        return run_key(step, step_sources()[step], self._params(step), self._hashes(step))
 
     def find(self, step: str) -> Record | None:
-        """The record of a step whose result is there and whole, taken as the step's; else None."""
+        """The record of a step whose result is there and whole, taken as the step's; else None, and `why` says why."""
         record = self._store.complete(step, self.job.flight_id, self.key(step))
         if record is None or (step == INGEST and not self._signals_whole(record)):
+            self.why[step] = why_it_runs(self._store.latest(step, self.job.flight_id), self._causes(step))
             return None
         self._take(step, record)
         return record
@@ -94,19 +113,23 @@ class FlightWork:
         WarehouseError
             The warehouse cannot be written: this concerns every log.
         """
+        began = time.perf_counter()
         record = self._ingest() if step == INGEST else self._stage(STAGES[step])
+        self.work_s += time.perf_counter() - began
         self._take(step, record)
         return record
 
-    def pending(self) -> list[str]:
-        """Steps whose result is missing, and those that read from them; nothing is run or changed."""
-        missing: list[str] = []
+    def pending(self) -> dict[str, str]:
+        """Steps whose result is missing, and those that read from them, each with why; nothing is run or changed."""
+        missing: dict[str, str] = {}
         for step in STEPS:
             if INGEST in self.records and not self.usable():
                 break
             sources = {name.split(".")[0] for name in STAGES[step].reads.values()} if step != INGEST else set()
-            if sources & set(missing) or self.find(step) is None:
-                missing.append(step)
+            if above := sorted(sources & set(missing)):
+                missing[step] = f"new input: {', '.join(above)}"
+            elif self.find(step) is None:
+                missing[step] = self.why[step]
         return missing
 
     def _take(self, step: str, record: Record) -> None:
@@ -116,11 +139,28 @@ class FlightWork:
         if step == INGEST:
             self._settings = ingest.settings_of(record["facts"], self._vehicle) if self.usable() else {}
 
-    def _params(self, stage: Stage) -> dict[str, Any]:
-        return {name: self._settings[name] for name in stage.settings}
+    def _params(self, step: str) -> dict[str, Any]:
+        if step != INGEST:
+            return {name: self._settings[name] for name in STAGES[step].settings}
+        settings = self._vehicle.settings()
+        named = {"vehicle_id": self.job.vehicle_id, "name": Path(self.job.path).name}
+        return {**{name: settings[name] for name in ("csv", "mcap", "units")}, **named}
 
-    def _hashes(self, stage: Stage) -> dict[str, str]:
-        return {name: self._inputs[name] for name in sorted(set(stage.reads.values())) if name in self._inputs}
+    def _hashes(self, step: str) -> dict[str, str]:
+        if step == INGEST:
+            return {"log": self.job.sha256 or ""}
+        sources = sorted(set(STAGES[step].reads.values()))
+        return {name: self._inputs[name] for name in sources if name in self._inputs}
+
+    def _causes(self, step: str) -> Record:
+        """What the key of a step is made of, as its record keeps it."""
+        return {
+            "run_key": self.key(step),
+            "params": plain(self._params(step)),
+            "inputs": self._hashes(step),
+            "source": step_sources()[step],
+            "versions": versions(),
+        }
 
     # --- ingest
 
@@ -130,7 +170,7 @@ class FlightWork:
             return self._ingest_record(ingest.rejected("not_readable", self.job.problem), {}, key, keep=False)
         try:
             facts, signals = self._write_signals(whole=False)
-        except ingest.Disordered:
+        except Disordered:
             facts, signals = self._write_signals(whole=True)
         except WarehouseError:
             raise
@@ -139,7 +179,7 @@ class FlightWork:
         if facts["verdict"] != "rejected" and file_stamp(Path(self.job.path)) != tuple(self.job.stamp):
             why = f"{self.job.log_uri} changed while it was read; the next night takes it when it is complete."
             return self._ingest_record(ingest.rejected("changed_while_read", why), {}, key, keep=False)
-        return self._ingest_record(facts, signals, key, keep=True)
+        return self._ingest_record(facts, signals, key, keep=facts["reason_code"] != ingest.TOO_SLOW)
 
     def _write_signals(self, *, whole: bool) -> tuple[dict[str, Any], dict[str, Any]]:
         """Stream the log into the signal tables; nothing appears unless the whole log came through."""
@@ -172,7 +212,7 @@ class FlightWork:
             "reason_code": facts["reason_code"],
             "reason": facts["reason"],
             "measured": plain({"rows": facts["rows"], "units": facts["units"], "verdict": facts["verdict"]}),
-            "versions": versions(),
+            **self._causes(INGEST),
             "facts": plain(facts),
             "signals": dict(signals),
         }
@@ -199,9 +239,7 @@ class FlightWork:
             "reason_code": result.reason_code,
             "reason": result.reason,
             "measured": plain(result.measured),
-            "versions": versions(),
-            "params": plain(self._params(stage)),
-            "inputs": self._hashes(stage),
+            **self._causes(stage.name),
         }
         if result.status == "failed":
             return _unkept(record, key)

@@ -247,6 +247,11 @@ VERSIONS = Column(
     provenance=True,
 )
 
+# --- faults
+FAULT_NUMBER = Column("number", _F64, "as its reason says", "what decided: a share, a ratio or a reading")
+FAULT_LIMIT = Column("limit", _F64, "as its reason says", "what the number was held against")
+FATAL = Column("fatal", pa.bool_(), "", "no stage that needs the sensor runs")
+
 # --- drift
 N_FLIGHTS = Column("n_flights", _I64, "1", "flights the regression used")
 VALUE_AT_25DEGC = Column("value_at_25degc", _F64, "named by column unit", "regressed value at 25 degC")
@@ -260,4 +265,28 @@ CHANGE_AT = Column(
     pa.timestamp("us", tz="UTC"),
     "",
     "start of the first flight after a detected step, UTC; null without one",
+)
+N_SESSIONS = Column("n_sessions", _I64, "1", "number of field sessions that count in the regression")
+AS_OF = Column(
+    "as_of",
+    pa.timestamp("us", tz="UTC"),
+    "",
+    "start of the last flight that counts, UTC: value_at_25degc and slope_per_day are as of then",
+)
+BEST_KNOWN_DEGC = Column(
+    "best_known_degc",
+    _F64,
+    "degC",
+    "temperature at which value and slope_per_degc are independent: var(T) = var there + slope sd^2 (T - it)^2",
+)
+SESSION_SD = Column(
+    "session_sd", _F64, "named by column unit", "scatter of the parameter between sessions beyond the flights' own sd"
+)
+CHANGE_SIZE = Column("change_size", _F64, "named by column unit", "size of the step at change_at; null without one")
+CHANGE_SIZE_SD = Column("change_size_sd", _F64, "named by column unit", "standard deviation of change_size")
+FLEET_Z = Column(
+    "fleet_z",
+    _F64,
+    "1",
+    "distance from the fleet's other IMUs, in sd; of a VPS lag: of its scatter's logarithm; null with few siblings",
 )

@@ -38,6 +38,14 @@ _SIGNALS = (
 
 _STAGES = (
     Table(
+        "faults",
+        "stage",
+        1,
+        "what is wrong with a sensor's readings; axis is empty for the whole triad",
+        (c.SENSOR, c.AXIS, c.REASON_CODE, c.FAULT_NUMBER, c.FAULT_LIMIT, c.FATAL, c.REASON),
+        ("sensor", "axis", "reason_code"),
+    ),
+    Table(
         "segments",
         "stage",
         1,
@@ -188,7 +196,7 @@ _HISTORY = (
     Table(
         "drift",
         "history",
-        1,
+        2,
         "one row an IMU, sensor, method, parameter and axis: trend over temperature and time",
         (
             c.VEHICLE_ID,
@@ -208,6 +216,16 @@ _HISTORY = (
             c.LAST_Z,
             c.CHANGE_AT,
             c.STATUS,
+            c.N_SESSIONS,
+            c.AS_OF,
+            c.BEST_KNOWN_DEGC,
+            c.TEMPERATURE_MIN_DEGC,
+            c.TEMPERATURE_MAX_DEGC,
+            c.SESSION_SD,
+            c.CHANGE_SIZE,
+            c.CHANGE_SIZE_SD,
+            c.FLEET_Z,
+            c.REASON,
         ),
         ("imu_id", "sensor", "method", "parameter", "axis"),
     ),

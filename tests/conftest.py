@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -15,7 +16,7 @@ def prefect_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of a server that is running, which fieldcal takes from the environment; started at the first use."""
     former = os.environ.pop("PREFECT_API_URL", None)
     prepare_environment(tmp_path_factory.mktemp("prefect"))
-    with Server(tmp_path_factory.getbasetemp()) as server:
+    with Server(Path(os.environ["PREFECT_HOME"])) as server:
         url = server.wait()
         yield url
     if former is not None:

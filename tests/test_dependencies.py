@@ -15,7 +15,7 @@ NUMERICS = {"fieldcal", "numpy", "scipy", "pygeomag"}
 TABLES = NUMERICS | {"schemas", "polars", "pyarrow"}
 LOGS = TABLES | {"mcap", "google", "lz4", "zstandard"}
 
-TABLE_LAYER = ("frames", "results", "pipeline", "simulate_logs", "ingest")
+TABLE_LAYER = ("frames", "results", "pipeline", "simulate_logs", "ingest", "tidy")
 """Modules of fieldcal that turn columns into arrays and back; all others are numerics and know no table."""
 
 ALLOWED = {

@@ -10,8 +10,9 @@ import polars as pl
 import pytest
 
 from fieldcal.errors import UnreadableLog
-from fieldcal.ingest import Disordered, TidyLog, TidySignal
+from fieldcal.ingest import TidyLog
 from fieldcal.logs import Columns, LogSummary
+from fieldcal.tidy import Disordered, TidySignal
 
 STEP_NS = 5_000_000
 
@@ -140,3 +141,11 @@ def test_streaming_gives_what_the_whole_log_gives() -> None:
     list(hopeless.add(rows(CLEAN, slice(500, 1000))))
     with pytest.raises(Disordered):
         list(hopeless.add(rows(CLEAN, slice(0, 500))))
+
+
+def test_a_log_that_takes_too_long_is_given_up() -> None:
+    batches = [rows(CLEAN, slice(i, i + 10)) for i in range(0, 1000, 10)]
+    log = TidyLog(Reader(*batches), "a.csv", seconds=0.0)
+    with pytest.raises(UnreadableLog, match="still being read") as caught:
+        list(log.tables())
+    assert caught.value.reason_code == "too_slow"

@@ -188,11 +188,14 @@ def test_a_frame_that_declares_100_gb_is_refused_at_once() -> None:
         mcap_chunks.decompress(chunk, head)
 
 
-def test_decompression_stops_at_the_total_cap(whole: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_that_grow_too_much_are_left_out_beyond_a_total(
+    whole: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(mcap_file, "TOTAL_CAP_BYTES", 100_000)
     monkeypatch.setattr(mcap_file, "TOTAL_CAP_RATIO", 1)
     tables, summary = read_or_none(tmp_path, whole)
-    assert "decompressed_cap" in codes(summary)
+    assert "unpacking more than 100000 bytes" in summary.findings[0].sentence
+    assert any(finding.loses_data for finding in summary.findings)
     assert 0 < tables["imu"].height < 400
 
 

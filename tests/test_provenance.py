@@ -17,6 +17,7 @@ import pytest
 
 from fieldcal import provenance
 from fieldcal.configuration import load
+from fieldcal.provenance import source_digest
 
 STAGES = '''
 """Stages."""
@@ -140,41 +141,41 @@ def test_wrapped_and_partial_functions_are_seen_through(toy: Path) -> None:
 
 
 def test_every_part_of_the_key_counts() -> None:
-    base = provenance.run_key("s", load, {"a": 1.0, "b": [1, 2]}, {"imu": "1", "vps": "2"})
+    base = provenance.run_key("s", source_digest(load), {"a": 1.0, "b": [1, 2]}, {"imu": "1", "vps": "2"})
     assert len(base) == 32
     assert int(base, 16) >= 0
-    assert provenance.run_key("s", load, {"b": [1, 2], "a": 1.0}, {"vps": "2", "imu": "1"}) == base
+    assert provenance.run_key("s", source_digest(load), {"b": [1, 2], "a": 1.0}, {"vps": "2", "imu": "1"}) == base
     different = {
-        provenance.run_key("t", load, {"a": 1.0, "b": [1, 2]}, {"imu": "1", "vps": "2"}),
-        provenance.run_key("s", provenance.run_key, {"a": 1.0, "b": [1, 2]}, {"imu": "1", "vps": "2"}),
-        provenance.run_key("s", load, {"a": 1.5, "b": [1, 2]}, {"imu": "1", "vps": "2"}),
-        provenance.run_key("s", load, {"a": 1.0, "b": [2, 1]}, {"imu": "1", "vps": "2"}),
-        provenance.run_key("s", load, {"a": 1.0, "b": [1, 2]}, {"imu": "2", "vps": "1"}),
-        provenance.run_key("s", load, {"a": 1.0, "b": [1, 2]}, {"imu": "1"}),
-        provenance.run_key("s", load, {"a": 1.0, "b": [1, 2]}, {"imu": "1", "vps": "2"}, extra={"x": 1}),
+        provenance.run_key("t", source_digest(load), {"a": 1.0, "b": [1, 2]}, {"imu": "1", "vps": "2"}),
+        provenance.run_key("s", source_digest(provenance.run_key), {"a": 1.0, "b": [1, 2]}, {"imu": "1", "vps": "2"}),
+        provenance.run_key("s", source_digest(load), {"a": 1.5, "b": [1, 2]}, {"imu": "1", "vps": "2"}),
+        provenance.run_key("s", source_digest(load), {"a": 1.0, "b": [2, 1]}, {"imu": "1", "vps": "2"}),
+        provenance.run_key("s", source_digest(load), {"a": 1.0, "b": [1, 2]}, {"imu": "2", "vps": "1"}),
+        provenance.run_key("s", source_digest(load), {"a": 1.0, "b": [1, 2]}, {"imu": "1"}),
+        provenance.run_key("s", source_digest(load), {"a": 1.0, "b": [1, 2]}, {"imu": "1", "vps": "2"}, extra={"x": 1}),
     }
     assert len(different | {base}) == 8
 
 
 def test_versions_of_the_libraries_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = provenance.run_key("s", load, {}, {})
+    before = provenance.run_key("s", source_digest(load), {}, {})
     assert set(provenance.library_versions()) == {"numpy", "scipy", "polars"}
     monkeypatch.setattr(provenance, "library_versions", lambda: {"numpy": "99"})
-    assert provenance.run_key("s", load, {}, {}) != before
+    assert provenance.run_key("s", source_digest(load), {}, {}) != before
 
 
 def test_parameters_must_be_plain_json() -> None:
     with pytest.raises(ValueError, match="JSON compliant"):
-        provenance.run_key("s", load, {"a": float("nan")}, {})
+        provenance.run_key("s", source_digest(load), {"a": float("nan")}, {})
     with pytest.raises(TypeError):
-        provenance.run_key("s", load, {"a": np.float32(1.0)}, {})
+        provenance.run_key("s", source_digest(load), {"a": np.float32(1.0)}, {})
 
 
 def test_the_key_is_the_same_in_every_process() -> None:
     script = """
         from fieldcal.configuration import load
-        from fieldcal.provenance import run_key
-        print(run_key("s", load, load(None).vehicle("v").settings(), {"imu": "1", "vps": "2"}))
+        from fieldcal.provenance import run_key, source_digest
+        print(run_key("s", source_digest(load), load(None).vehicle("v").settings(), {"imu": "1", "vps": "2"}))
     """
     found = {
         subprocess.run(

@@ -87,11 +87,13 @@ def test_a_damaged_output_is_not_loaded(tmp_path: Path) -> None:
 
 
 def test_a_failed_save_is_not_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stages, _ = saved(tmp_path)
+    stages, record = saved(tmp_path / "whole")
     monkeypatch.setattr("warehouse.stage_store.write_bytes", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
-        saved(tmp_path)
-    assert stages.complete(*WHERE) is None
+    for folder in ("whole", "fresh"):
+        with pytest.raises(KeyboardInterrupt):
+            saved(tmp_path / folder)
+    assert StageStore(tmp_path / "fresh").complete(*WHERE) is None
+    assert stages.complete(*WHERE) == record  # the same outputs: who reads them meanwhile is not disturbed
 
 
 def test_records_are_plain_json(tmp_path: Path) -> None:

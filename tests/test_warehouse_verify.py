@@ -61,6 +61,25 @@ def test_any_flipped_bit_of_any_kept_file_is_found(root: Path) -> None:
     assert verify(root)["ok"]
 
 
+def test_400_flips_of_single_bits_are_found_400_times(root: Path) -> None:
+    kept = sorted(path for path in root.rglob("*") if path.suffix in (".parquet", ".json"))
+    ends = np.cumsum([path.stat().st_size * 8 for path in kept])
+    found = 0
+    for bit in np.random.default_rng(400).integers(0, ends[-1], 400).tolist():
+        number = int(np.searchsorted(ends, bit, side="right"))
+        path, inside = kept[number], bit - (int(ends[number - 1]) if number else 0)
+        whole = path.read_bytes()
+        changed = bytearray(whole)
+        changed[inside // 8] ^= 1 << (inside % 8)
+        path.write_bytes(changed)
+        (damage,) = verify(root)["damaged"]
+        # A flipped record of a checksum is told by the name of the file whose checksum it is.
+        found += Path(damage["path"]).name.split(".")[0] == path.name.split(".")[0]
+        path.write_bytes(whole)
+    assert found == 400
+    assert verify(root)["ok"]
+
+
 def test_missing_and_foreign_files_are_named(root: Path) -> None:
     signal_path(root, "position", "v", "a").unlink()
     (root / "tables" / "flight" / "vehicle_id=v" / "copy.parquet").write_bytes(b"x")

@@ -17,6 +17,7 @@ class WarehouseError(FieldcalError):
 _KNOWN = {
     errno.ENOSPC: ("disk_full", "the disk is full; free some space"),
     errno.EDQUOT: ("disk_full", "the disk quota is used up; free some space"),
+    errno.EFBIG: ("disk_full", "files of this size are not allowed here; raise `ulimit -f` or free some space"),
     errno.EROFS: ("read_only", "the file system is read-only; remount it or name another --warehouse"),
     errno.EACCES: (
         "permission_denied",
@@ -30,6 +31,8 @@ _KNOWN = {
     errno.ENOTDIR: ("not_a_folder", "a file stands where a folder is needed; move it or name another --warehouse"),
     errno.EEXIST: ("not_a_folder", "a file stands where a folder is needed; move it or name another --warehouse"),
     errno.EISDIR: ("not_a_file", "a folder stands where a file is needed; move it"),
+    errno.ELOOP: ("link_loop", "its links lead in a circle; remove them"),
+    errno.ENAMETOOLONG: ("name_too_long", "its name is too long for this file system; name another --warehouse"),
     errno.EMFILE: ("too_many_files", "too many files are open; raise `ulimit -n`"),
 }
 

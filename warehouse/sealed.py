@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 _SEAL = "sealed_sha256"
+_END = b"\n}\n"
 
 
 class BrokenSeal(ValueError):
@@ -15,9 +16,12 @@ class BrokenSeal(ValueError):
 
 
 def seal(record: Mapping[str, Any]) -> bytes:
-    """Canonical JSON of `record` with its digest inside. Plain JSON only: no NaN, no objects of other kinds."""
+    """JSON of `record`, keys sorted, its digest in the last line. Plain JSON only: no NaN, no objects."""
     body = {key: value for key, value in record.items() if key != _SEAL}
-    return _canonical({**body, _SEAL: hashlib.sha256(_canonical(body)).hexdigest()})
+    if not body:
+        raise ValueError("an empty record has nothing to seal")
+    text = (json.dumps(body, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n").encode()
+    return text.removesuffix(_END) + _last_line(text)
 
 
 def unseal(data: bytes) -> dict[str, Any]:
@@ -28,17 +32,16 @@ def unseal(data: bytes) -> dict[str, Any]:
     BrokenSeal
         A byte differs from what was written.
     """
+    head, comma, _ = data.rpartition(b",\n")
+    if not comma or head + _last_line(head + _END) != data:
+        raise BrokenSeal("it is not what was written")
     try:
         record = json.loads(data)
     except ValueError as error:
         raise BrokenSeal("it is not JSON") from error
-    if not isinstance(record, dict) or _SEAL not in record:
-        raise BrokenSeal("it has no digest of its own")
-    body = {key: value for key, value in record.items() if key != _SEAL}
-    if seal(body) != data:
-        raise BrokenSeal("it is not what was written")
-    return body
+    return {key: value for key, value in record.items() if key != _SEAL}
 
 
-def _canonical(record: Mapping[str, Any]) -> bytes:
-    return (json.dumps(record, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n").encode()
+def _last_line(text: bytes) -> bytes:
+    """What follows the body of a record whose JSON is `text`."""
+    return f',\n "{_SEAL}": "{hashlib.sha256(text).hexdigest()}"'.encode() + _END

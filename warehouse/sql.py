@@ -1,13 +1,13 @@
 """One SELECT over the history in DuckDB, locked down: no files, no network, no settings, bounded in memory and time.
 
-The engine never opens a file: it reads Arrow datasets that are made here and handed over, and only then is everything
-external switched off and the configuration locked.
+The engine may open the history's own files, named one by one, for reading; everything else external is switched off and
+the configuration locked before the query is looked at.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
@@ -16,7 +16,6 @@ from typing import Any
 import duckdb
 import polars as pl
 import pyarrow as pa
-import pyarrow.dataset
 
 import schemas
 from schemas import HISTORY_TABLES
@@ -24,9 +23,11 @@ from warehouse.errors import WarehouseError
 from warehouse.layout import history_files, vehicle_of
 from warehouse.store import frame
 
+# In the order in which they are made: later ones may need earlier ones.
 VIEWS = ("latest_calibration", "history", "drift_by_temperature", "worst_tic", "refusals", "calibration_at")
 
 _READING = frozenset({"SELECT", "EXPLAIN"})
+_ABOUT_ALL = ("show", "describe", "summarize", "information_schema", "duckdb_", "pg_", "pragma_")
 _ROWS_PER_BATCH = 65_536
 _CONFIG: dict[str, str | bool | int | float | list[str]] = {
     "autoinstall_known_extensions": False,
@@ -61,30 +62,72 @@ def run_sql(
         `sql_refused` (not one SELECT, or it reaches outside), `sql_wrong` (syntax, unknown names, wrong types),
         `sql_timeout`, `sql_too_large`.
     """
+    texts = {view: (files("warehouse") / "views" / f"{view}.sql").read_text(encoding="utf-8") for view in VIEWS}
+    with _sentences(timeout_s, memory_mb):
+        try:
+            return _answer(root, query, parameters, _named(query, texts), timeout_s, memory_mb, max_result_mb)
+        except (
+            duckdb.CatalogException
+        ):  # a name that was not recognised in the text, or a mistake, best explained by all
+            return _answer(root, query, parameters, texts, timeout_s, memory_mb, max_result_mb)
+
+
+def _named(query: str, texts: Mapping[str, str]) -> dict[str, str]:
+    """The views that a query may need: those whose name is in its text, and what these need. Making them costs most."""
+    if any(word in query.lower() for word in _ABOUT_ALL):
+        return dict(texts)
+    named: dict[str, str] = {}
+    for view in reversed(VIEWS):
+        if view in query.lower() or any(view in text for text in named.values()):
+            named[view] = texts[view]
+    return dict(reversed(named.items()))
+
+
+def _answer(
+    root: Path,
+    query: str,
+    parameters: Sequence[Any] | None,
+    views: Mapping[str, str],
+    timeout_s: float,
+    memory_mb: int,
+    max_result_mb: int,
+) -> pl.DataFrame:
+    needed = "".join([query.lower(), *views.values()]) if len(views) < len(VIEWS) else "".join(HISTORY_TABLES)
     with duckdb.connect(":memory:", config={**_CONFIG, "memory_limit": f"{memory_mb}MB"}) as connection:
-        for table in HISTORY_TABLES:
-            connection.register(table, _dataset(root, table))
-        for view in VIEWS:
-            connection.execute((files("warehouse") / "views" / f"{view}.sql").read_text(encoding="utf-8"))
+        paths = {table: history_files(root, table) for table in HISTORY_TABLES if table in needed}
+        for table, own in paths.items():
+            if own:
+                connection.execute(_table_view(table, own))
+            else:
+                connection.register(table, schemas.arrow_schema(table).empty_table())
+        for text in views.values():
+            connection.execute(text)
         connection.execute("SET TimeZone = 'UTC'")
+        connection.execute(f"SET allowed_paths = {_listed([path for own in paths.values() for path in own])}")
         connection.execute("SET enable_external_access = false")
         connection.execute("SET lock_configuration = true")
-        with _sentences(timeout_s, memory_mb), _time_limit(connection, timeout_s):
+        with _time_limit(connection, timeout_s):
             statement = _one_reading_statement(connection, query)
             return _result(connection.sql(statement, params=parameters), max_result_mb)
 
 
-def _dataset(root: Path, table: str) -> pa.dataset.Dataset:
-    """The table's files, each known by its vehicle, so that a query for one vehicle opens one file."""
-    schema = schemas.arrow_schema(table).remove_metadata()
-    parquet = pa.dataset.ParquetFileFormat()
-    filesystem = pa.fs.LocalFileSystem()
-    fragments = []
-    for path in history_files(root, table):
-        vehicle_id = vehicle_of(path)
-        known = None if vehicle_id is None else pa.dataset.field("vehicle_id") == vehicle_id
-        fragments.append(parquet.make_fragment(str(path), filesystem, partition_expression=known))
-    return pa.dataset.FileSystemDataset(fragments, schema, parquet, filesystem)
+def _table_view(table: str, paths: Sequence[Path]) -> str:
+    """A view over a table's files. Where folders tell the vehicles exactly, a query for one vehicle opens one file.
+
+    Columns are qualified: inside a macro a bare name would be the macro's parameter.
+    """
+    by_folder = all(vehicle_of(path) for path in paths)
+    how = (
+        "hive_partitioning = true, hive_types = {'vehicle_id': 'VARCHAR'}" if by_folder else "hive_partitioning = false"
+    )
+    columns = ", ".join(f'f."{name}"' for name in schemas.TABLES[table].column_names)
+    return f"CREATE VIEW {table} AS SELECT {columns} FROM read_parquet({_listed(paths)}, {how}) AS f"
+
+
+def _listed(paths: Sequence[Path]) -> str:
+    """Absolute paths as a SQL list; a quote in one is doubled."""
+    quoted = ("'" + str(path.absolute()).replace("'", "''") + "'" for path in paths)
+    return f"[{', '.join(quoted)}]"
 
 
 def _one_reading_statement(connection: duckdb.DuckDBPyConnection, query: str) -> duckdb.Statement:

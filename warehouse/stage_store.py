@@ -52,6 +52,16 @@ class StageStore:
             return None
         return None if any(broken_outputs(self.folder(stage, flight_id, run_key), record)) else record
 
+    def latest(self, stage: str, flight_id: str) -> dict[str, Any] | None:
+        """The record last written for this stage of this flight, whatever its key; None when there is none."""
+        found = self.folder(stage, flight_id, "any").parent.glob(f"*/{RECORD}")
+        for path in sorted(found, key=lambda path: (_written_ns(path), path), reverse=True):
+            try:
+                return unseal(path.read_bytes())
+            except (OSError, BrokenSeal):
+                continue
+        return None
+
     def save(
         self,
         stage: str,
@@ -65,12 +75,11 @@ class StageStore:
         """Write the outputs and, last, the record; the record as `complete` returns it.
 
         `record` is plain JSON (no NaN, no numpy values); the keys stage, flight_id, run_key and outputs are set here.
+        Another process may be writing the same execution, and may be reading it already: a record that is there stays
+        until the new one replaces it, and says by its sha256s which outputs it means.
         """
         folder = self.folder(stage, flight_id, run_key)
         prepare(self.root)
-        with disk(folder, "written"):
-            if (folder / RECORD).exists():
-                (folder / RECORD).unlink()
         outputs = {}
         for table, rows in tables.items():
             path = folder / f"{table}.parquet"
@@ -104,6 +113,13 @@ class StageStore:
                 "stage_incomplete", f"stage {stage} of this run wrote no table {absent[0]} ({folder})."
             )
         return {table: _output(folder, table, outputs[table]) for table in wanted}
+
+
+def _written_ns(path: Path) -> int:
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def broken_outputs(folder: Path, record: Mapping[str, Any]) -> Iterator[tuple[Path, str]]:

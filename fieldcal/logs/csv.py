@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs import csv_columns as columns_of
 from fieldcal.logs.csv_dialect import cells_of, find_dialect
-from fieldcal.logs.csv_rows import Losses, numbers_of, read_rows
+from fieldcal.logs.csv_rows import Losses, numbers_of, other_header, read_rows
 from fieldcal.logs.csv_text import LineBlocks
 from fieldcal.logs.csv_time import looks_iso8601, nanoseconds, sample_numbers, sample_times
 from fieldcal.logs.csv_units import time_unit
@@ -28,12 +28,14 @@ from fieldcal.logs.interface import (
 from fieldcal.logs.interface import Columns as BatchColumns
 
 VPS_COLUMNS = {"quaternion_xyzw": ("qx", "qy", "qz", "qw"), "position": ("px_m", "py_m", "pz_m")}
+_LINES_LOOKED_AT = 50
 _LOSS_SENTENCES = {
     "ragged_row": ("have more or fewer fields than the header and were left out", True),
     "nul_bytes": ("contain NUL bytes and were left out", True),
     "bad_time": ("have a time that is none and were left out", True),
     "bad_number": ("have a cell that is no number and were left out", True),
     "incomplete_row": ("have only part of a sensor's cells and were left out", True),
+    "header_changed": ("name the columns anew and differently; nothing behind them was read: split the file", True),
     "repeated_header": ("repeat the header; several recordings may stand in one file", False),
 }
 
@@ -100,8 +102,14 @@ class CsvTable:
                     f"{losses.first_lines['ragged_row']}), read with separator {self.dialect.separator!r}. Correct "
                     "csv.separator and csv.decimal, or the file.",
                 )
+            changed = other_header(frame, self.dialect)
+            if changed is not None:
+                losses.add("header_changed", numbers[changed : changed + 1])
+                frame, numbers = frame[:changed], numbers[:changed]
             places = row + (numbers - line)
             yield from self._block(frame, numbers, places, losses)
+            if changed is not None:
+                break
             line, row = line + lines, row + lines
         self._report(losses)
 
@@ -118,7 +126,7 @@ class CsvTable:
         return columns_of.find_columns(self.dialect, configured, defaults, table, self._name)
 
     def _cells_of_first_row(self, block: bytes) -> list[str]:
-        for line in block.split(b"\n")[self.dialect.first_row :]:
+        for line in block.split(b"\n", self.dialect.first_row + _LINES_LOOKED_AT)[self.dialect.first_row : -1]:
             text = line.decode("utf-8", "replace")
             if text.strip() and not text.startswith("#"):
                 return cells_of(text, self.dialect.separator)

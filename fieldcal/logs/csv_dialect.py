@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 
 from fieldcal.errors import UnreadableLog
@@ -14,7 +15,9 @@ WHITESPACE = " "
 QUOTE = '"'
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$|[+-]?(nan|inf|infinity)$", re.IGNORECASE)
 _COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?$")
+_SEPARATOR_LINE = re.compile(r'"?sep=([,;\t|])"?$', re.IGNORECASE)
 _LINES_LOOKED_AT = 50
+COLUMNS_CAP = 10_000
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,8 @@ def cells_of(line: str, separator: str) -> list[str]:
     if separator == WHITESPACE:
         return line.split()
     if QUOTE in line:
-        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
+        with suppress(csv.Error):
+            return [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
     return [cell.strip() for cell in line.split(separator)]
 
 
@@ -58,13 +62,16 @@ def find_dialect(block: bytes, log_name: str, separator: str | None, decimal: st
     Raises
     ------
     UnreadableLog
-        `missing_header`, `not_text`, `no_rows`.
+        `missing_header`, `not_text`, `no_rows`, `too_many_columns`.
     """
     lines = block.split(b"\n", _LINES_LOOKED_AT * 4)[: _LINES_LOOKED_AT * 4]
     texts = [_text(line) for line in lines]
     body = [number for number, text in enumerate(texts) if text.strip() and not text.lstrip().startswith("#")]
     if not body:
         raise UnreadableLog("no_rows", f"{log_name} holds no rows. Nothing was recorded.")
+    declared = _SEPARATOR_LINE.match(texts[body[0]].strip())
+    if declared and len(body) > 1:
+        separator, body = separator or declared[1], body[1:]
     place = body[0]
     if b"\0" in lines[place] or (not texts[place].replace("\t", " ").isprintable()):
         raise UnreadableLog("not_text", f"{log_name} does not begin with a readable header line. Check what it is.")
@@ -83,6 +90,11 @@ def find_dialect(block: bytes, log_name: str, separator: str | None, decimal: st
                 f"{log_name} has no header: its first line holds only numbers. Put a line with the column names first.",
             )
         header, first_row = b"", place
+    if len(names) > COLUMNS_CAP:
+        raise UnreadableLog(
+            "too_many_columns",
+            f"{log_name} has {len(names)} columns, {COLUMNS_CAP} at most are read. Check what it is.",
+        )
     unit_row = None
     if header and data:
         cells = cells_of(data[0], found)

@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from fieldcal.logs.csv_dialect import QUOTE, WHITESPACE, Dialect
+from fieldcal.logs.csv_dialect import QUOTE, WHITESPACE, Dialect, is_number
 
 MISSING_CELLS = ("", "nan", "null", "na", "n/a", "none", "-")
 _LINE_FEED, _COMMENT = 10, ord("#")
@@ -26,12 +26,13 @@ class Losses:
     _last_lines: dict[str, NDArray[np.int64]] = field(default_factory=dict)
 
     def add(self, reason: str, lines: NDArray[np.int64]) -> None:
-        """Count `lines` (line numbers) under `reason`; a line that several tables lose counts once."""
-        new = np.setdiff1d(lines, self._last_lines.get(reason, lines[:0]))
+        """Count `lines` (ascending numbers) under `reason`; a line that several tables lose counts once."""
+        last = self._last_lines.get(reason)
+        new = lines if last is None else np.setdiff1d(lines, last, assume_unique=True)
         if new.size:
             self.counts[reason] = self.counts.get(reason, 0) + int(new.size)
             self.first_lines[reason] = min(int(new[0]), self.first_lines.get(reason, int(new[0])))
-            self._last_lines[reason] = np.union1d(self._last_lines.get(reason, new), new)
+            self._last_lines[reason] = new if last is None else np.concatenate([last, new])
 
     def next_block(self) -> None:
         """The lines to come are others than those met so far."""
@@ -82,6 +83,20 @@ def numbers_of(cells: pl.Series) -> tuple[NDArray[np.float64], NDArray[np.bool_]
     return np.where(np.isfinite(numbers), numbers, np.nan), bad
 
 
+def other_header(frame: pl.DataFrame, dialect: Dialect) -> int | None:
+    """Position of the first row that names columns of this file in another order: what follows it means other things.
+
+    `frame` holds cells as text, its columns named by their position.
+    """
+    own = {name: dialect.names[int(name)] for name in frame.columns}
+    names = [name for name in dialect.names if name and not is_number(name)]
+    named = frame.select(pl.sum_horizontal(pl.col(*own).str.strip_chars().is_in(names)).alias("n")).to_series()
+    for place in (named * 2 > len(own)).arg_true().to_list():
+        if any(cell is None or cell.strip() != own[name] for name, cell in frame.row(place, named=True).items()):
+            return int(place)
+    return None
+
+
 def _unquoted(block: bytes, separator: str) -> tuple[bytes, list[int]]:
     """The block with quotes resolved, and the positions of lines whose quotes do not close.
 
@@ -92,7 +107,11 @@ def _unquoted(block: bytes, separator: str) -> tuple[bytes, list[int]]:
     lines = block.split(b"\n")
     unclosed = []
     for number, line in enumerate(lines):
-        if QUOTE.encode() not in line:
+        quotes = line.count(QUOTE.encode())
+        if not quotes:
+            continue
+        if quotes % 2:
+            unclosed.append(number)
             continue
         try:
             cells = next(csv.reader([line.decode("utf-8", "surrogateescape")], delimiter=separator, strict=True))
@@ -115,7 +134,8 @@ def _silent(
 ) -> NDArray[np.bool_]:
     """Lines that are no rows and lose nothing: empty, comments, the header once more."""
     silent: NDArray[np.bool_] = (ends == starts) | (data[starts] == _COMMENT)
-    for line in np.flatnonzero((ends - starts < 64) & (data[starts] == ord(" ")) & ~silent).tolist():
+    blank = (data[starts] == ord(" ")) | (data[starts] == ord("\t"))
+    for line in np.flatnonzero((ends - starts < 64) & blank & ~silent).tolist():
         silent[line] = not block[starts[line] : ends[line]].strip()
     if dialect.header:
         alike = np.flatnonzero((data[starts] == dialect.header[0]) & (ends - starts == len(dialect.header)))

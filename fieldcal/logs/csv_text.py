@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import codecs
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 from fieldcal.errors import UnreadableLog
 
-BLOCK_BYTES = 16 << 20
+BLOCK_BYTES = 4 << 20
 LINE_CAP_BYTES = 1 << 20
 _BOMS = ((codecs.BOM_UTF8, "utf-8"), (codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be"))
 _PROBE_BYTES = 4096
+_NULS = re.compile(rb"\0{2,}")
 
 
 class LineBlocks:
     """Whole lines of a file as UTF-8 bytes, each ended by a single line feed.
 
-    Byte-order marks, UTF-16 and the line ends CR LF and CR are taken away. Undecodable bytes of a UTF-8 file are left
-    as they are. `unterminated` tells, once iterated, that the last line had no end; it is not delivered.
+    Byte-order marks, UTF-16 and the line ends CR LF and CR are taken away, runs of NUL bytes become one. Undecodable
+    bytes of a UTF-8 file are left as they are. `unterminated` tells, once iterated, that the last line had no end and
+    was not delivered.
 
     Raises
     ------
@@ -45,7 +48,7 @@ class LineBlocks:
             with self._path.open("rb") as stream:
                 stream.seek(self._skip)
                 while piece := stream.read(BLOCK_BYTES):
-                    rest += decoder.decode(piece).encode() if decoder else piece
+                    rest += _NULS.sub(b"\0", decoder.decode(piece).encode() if decoder else piece)
                     held = rest.endswith(b"\r")
                     lines, rest = _split(rest[:-1] if held else rest)
                     rest += b"\r" if held else b""

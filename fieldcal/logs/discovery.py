@@ -70,7 +70,7 @@ def find_logs(archive: Path, logs_map: Iterable[LogsEntry] | None = None) -> lis
 
     Notes
     -----
-    Hidden names are skipped. Links are followed only while they stay inside the archive.
+    Hidden names are skipped. Links are followed only while they stay inside the archive, those of a folder's files too.
     """
     root = archive.resolve()
     found: dict[str, LogFile] = {}
@@ -90,7 +90,12 @@ def find_logs(archive: Path, logs_map: Iterable[LogsEntry] | None = None) -> lis
 def _add(found: dict[str, LogFile], archive: Path, root: Path, path: Path, vehicle: str, session: str) -> None:
     if not _inside(path, root):
         return
-    kind = log_format(path)
+    try:
+        kind = log_format(path)
+        if kind is not None and path.is_dir() and not all(_inside(part, root) for part in folder_parts(path)):
+            return
+    except OSError:  # a folder that may not be entered: whoever reads it will say so
+        kind = FOLDER_FORMAT
     log_uri = path.relative_to(archive).as_posix()
     if kind is not None and log_uri not in found:
         found[log_uri] = LogFile(path, log_uri, vehicle, session, kind)

@@ -17,6 +17,7 @@ from fieldcal.logs.mcap_report import Definitions, report
 from fieldcal.logs.mcap_roles import METADATA_NAME, SI_TYPES, Source, choose_sources
 
 SI_UNITS = {"gyroscope": "rad/s", "accelerometer": "m/s^2", "magnetometer": "T"}
+CHANNELS_CAP = 4096
 _U2, _U8 = np.dtype("<u2"), np.dtype("<u8")
 
 
@@ -33,8 +34,8 @@ class McapLog:
     Raises
     ------
     UnreadableLog
-        `empty_file`, `not_mcap`, `not_readable`, `no_messages`, `missing_topic`, `missing_field`, `missing_sensor`,
-        `unsupported_schema`; from `batches()` only `no_messages`.
+        `empty_file`, `not_mcap`, `not_readable`, `no_messages`, `too_many_channels`, `missing_topic`,
+        `missing_field`, `missing_sensor`, `unsupported_schema`; from `batches()` only `no_messages`.
     """
 
     def __init__(self, path: Path, vehicle: VehicleLike) -> None:
@@ -51,6 +52,12 @@ class McapLog:
                 "no_messages",
                 f"{self._name} holds no whole chunk and no definition of any topic: it was cut or damaged before the "
                 "first messages were safe. Nothing of it can be used.",
+            )
+        if len(definitions.channels) > CHANNELS_CAP:
+            raise UnreadableLog(
+                "too_many_channels",
+                f"{self._name} defines {len(definitions.channels)} channels, {CHANNELS_CAP} at most are read: it is "
+                "damaged, or no flight log. Check what it is.",
             )
         self._file.definitions = definitions
         self._sources = choose_sources(definitions, vehicle.mcap, self.summary, self._name)

@@ -30,6 +30,7 @@ CHUNK_CAP_BYTES = 256 << 20
 ZSTD_WINDOW_CAP_BYTES = 128 << 20
 OTHER_RECORDS_CAP = 100_000
 _PIECE_BYTES = 1 << 20
+_FED_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -65,33 +66,36 @@ def decompress(buffer: Buffer, head: ChunkHead) -> bytes | memoryview:
     return content
 
 
-def _zstd(packed: memoryview, size: int) -> bytes:
+def _zstd(packed: memoryview, size: int) -> bytes | memoryview:
     decompressor = zstandard.ZstdDecompressor(max_window_size=ZSTD_WINDOW_CAP_BYTES)
     if size and zstandard.frame_content_size(packed) == size:
         return decompressor.decompress(packed, allow_extra_data=False)
     reader = decompressor.stream_reader(packed, read_across_frames=True)
-    pieces: list[bytes] = []
-    left = size + 1
-    while left and (piece := reader.read(min(left, _PIECE_BYTES))):
-        pieces.append(piece)
-        left -= len(piece)
-    return b"".join(pieces)
+    content, filled = bytearray(size + 1), 0
+    with memoryview(content) as room:
+        while filled <= size and (count := reader.readinto(room[filled : filled + _PIECE_BYTES])):
+            filled += count
+    return memoryview(content)[:filled]
 
 
-def _lz4(packed: memoryview, size: int) -> bytes:
-    pieces: list[bytes] = []
-    left, rest = size + 1, bytes(packed)
-    while left and rest:
-        frame = lz4.frame.LZ4FrameDecompressor()
-        while left and not frame.eof:
-            piece = frame.decompress(rest, max_length=min(left, _PIECE_BYTES))
-            rest = b""
-            if not piece and frame.needs_input:
-                return b"".join(pieces)
-            pieces.append(piece)
-            left -= len(piece)
-        rest = frame.unused_data or b""
-    return b"".join(pieces)
+def _lz4(packed: memoryview, size: int) -> memoryview:
+    """All frames, fed in pieces: the decompressor copies what it is fed and does not use."""
+    content, filled, position = bytearray(size + 1), 0, 0
+    frame = lz4.frame.LZ4FrameDecompressor()
+    rest = b""
+    while filled <= size:
+        if frame.eof:
+            rest, frame = frame.unused_data or b"", lz4.frame.LZ4FrameDecompressor()
+        if not rest and frame.needs_input:
+            if position == len(packed):
+                break
+            rest = bytes(packed[position : position + _FED_BYTES])
+            position += len(rest)
+        piece = frame.decompress(rest, max_length=min(size + 1 - filled, _PIECE_BYTES))
+        rest = b""
+        content[filled : filled + len(piece)] = piece
+        filled += len(piece)
+    return memoryview(content)[:filled]
 
 
 def locate_messages(data: NDArray[np.uint8], hints: Sequence[NDArray[np.uint64]]) -> Located:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldcal.errors import UnreadableLog
+from fieldcal.logs.mapped import map_file
 from fieldcal.logs.mcap_chunks import CHUNK_CAP_BYTES, decompress, locate_messages
 from fieldcal.logs.mcap_records import (
     CHANNEL,
@@ -39,6 +40,7 @@ from fieldcal.logs.mcap_records import (
     Fields,
     Record,
     Statistics,
+    check_first_record,
     check_record,
     gather,
     read_channel,
@@ -53,7 +55,7 @@ from fieldcal.logs.mcap_summary import ends_whole, read_summary
 
 TOTAL_CAP_BYTES = 512 << 20
 TOTAL_CAP_RATIO = 64
-"""A file may decompress to 512 MiB, or to 64 times its own size when that is more (real logs: 2 to 15 times)."""
+"""A chunk may unpack to 64 times its own size (real logs: 2 to 15 times); all that go beyond, to 512 MiB together."""
 
 MESSAGES_AT_ONCE = 1 << 16
 LOOSE_BYTES = 4 << 20
@@ -92,15 +94,17 @@ class McapFile:
 
     def __init__(self, path: Path) -> None:
         self.name = path.name
-        self.buffer = _map(path)
+        self.buffer = map_file(path)
         self.size = len(self.buffer)
         self.definitions = Definitions()
         self.metadata: dict[str, dict[str, str]] = {}
         self.statistics: Statistics | None = None
         self.tally = Tally()
-        self._budget = max(TOTAL_CAP_BYTES, TOTAL_CAP_RATIO * self.size)
+        self._budget = TOTAL_CAP_BYTES
+        self._searched: tuple[int, int | None] | None = None
         self._seen: dict[tuple[int, int, int, int], tuple[int, int]] = {}
         self._lost_chunk = False
+        self._unsure = -1
         self._released = 0
         self._limit = self.size
         self._data_end: int | None = None
@@ -140,7 +144,7 @@ class McapFile:
             record = self._sound_record(position)
             if record is None:
                 declared_end = self._declared_end(position)
-                position = self._resynchronised(position, declared_end)
+                position = self._resynchronised(self._unsure if self._unsure >= 0 else position, declared_end)
                 if position is None and declared_end is None and not self._has_end:
                     self.tally.forget_cut()
             elif record.opcode == CHUNK:
@@ -180,11 +184,8 @@ class McapFile:
 
     def _chunk_by_inner_length(self, position: int) -> int | None:
         """End of a chunk whose record length is wrong, when its inner length leads to content that fits its CRC."""
-        opened = self._open_chunk(position, self._limit)
-        if isinstance(opened, str) or not opened[0].crc:
-            return None
-        self._budget += opened[0].uncompressed_size
-        return opened[0].end
+        opened = self._open_chunk(position, self._limit, searching=True)
+        return None if isinstance(opened, str) or not opened[0].crc else opened[0].end
 
     def _declared_end(self, position: int) -> int | None:
         try:
@@ -199,6 +200,7 @@ class McapFile:
                 self.tally.lost[channel_id] += len(offsets)
             return record.end
         self._lost_chunk = record.opcode >= FIRST_PRIVATE_OPCODE
+        self._unsure = record.start if self._lost_chunk else -1
         if record.opcode == METADATA:
             name, pairs = read_metadata(Fields(self.buffer, record.body, record.end))
             self.metadata[name] = pairs
@@ -225,7 +227,7 @@ class McapFile:
             self.tally.damaged_records.append((record.start, "the CRC of the data section does not match"))
 
     def _chunk(self, record: Record) -> Generator[Block, None, int | None]:
-        self._lost_chunk = False
+        self._lost_chunk, self._unsure = False, -1
         opened = self._open_chunk(record.start, record.end)
         if isinstance(opened, str):
             self.tally.damaged_chunks.append((record.start, opened))
@@ -254,20 +256,37 @@ class McapFile:
         yield from self._slices(data, located.starts, head.crc != 0)
         return after
 
-    def _open_chunk(self, start: int, limit: int) -> tuple[ChunkHead, bytes | memoryview] | str:
-        """Head and content of the chunk at `start`, or why it cannot be read."""
+    def _open_chunk(
+        self, start: int, limit: int, *, searching: bool = False
+    ) -> tuple[ChunkHead, bytes | memoryview] | str:
+        """Head and content of the chunk at `start`, or why it cannot be read.
+
+        Chunks read one behind the other cannot unpack to more than their ratio allows. Where chunks are searched for,
+        false ones may overlap: each that fails draws on what all together may cost.
+        """
         try:
             head = read_chunk_head(Fields(self.buffer, start + HEAD_BYTES, limit))
-            if head.uncompressed_size > CHUNK_CAP_BYTES:
-                raise Damage(f"the chunk declares {head.uncompressed_size} bytes, the cap is {CHUNK_CAP_BYTES}")
-            if head.uncompressed_size > self._budget:
-                cap = max(TOTAL_CAP_BYTES, TOTAL_CAP_RATIO * self.size)
-                self.tally.stopped = f"decompressing more than {cap} bytes is refused"
-                return self.tally.stopped
-            self._budget -= head.uncompressed_size
-            return head, decompress(self.buffer, head)
+            size = head.uncompressed_size
+            if size > CHUNK_CAP_BYTES:
+                raise Damage(f"the chunk declares {size} bytes, the cap is {CHUNK_CAP_BYTES}")
+            if searching and not head.compression:
+                check_first_record(self.buffer, head)
+            if searching or size > TOTAL_CAP_RATIO * (head.end - head.start):
+                if size > self._budget:
+                    return self._refused(searching)
+                self._budget -= size
+            content = decompress(self.buffer, head)
+            if searching:
+                self._budget += size
+            return head, content
         except Damage as damage:
             return str(damage)
+
+    def _refused(self, searching: bool) -> str:
+        if not searching:
+            return f"unpacking more than {TOTAL_CAP_BYTES} bytes from chunks that grow {TOTAL_CAP_RATIO} times is refused"
+        self.tally.stopped = f"searching more than {TOTAL_CAP_BYTES} bytes behind damage for a chunk is refused"
+        return self.tally.stopped
 
     def _indexes(self, position: int) -> tuple[list[NDArray[np.uint64]], int]:
         """The message indexes that follow a chunk, and the position behind them."""
@@ -293,7 +312,7 @@ class McapFile:
 
     def _loose(self, record: Record) -> Generator[Block, None, int | None]:
         """Messages outside chunks: a run of them is one block."""
-        self._lost_chunk = False
+        self._lost_chunk, self._unsure = False, -1
         begin, starts, position = record.start, [], record.start
         current: Record | None = record
         while current is not None and current.opcode in (SCHEMA, CHANNEL, MESSAGE):
@@ -344,6 +363,15 @@ class McapFile:
 
     def _next_chunk(self, position: int) -> int | None:
         """The next chunk whose content matches its CRC."""
+        if self._searched is not None:
+            start, found = self._searched
+            if start <= position and (found is None or position <= found):
+                return found
+        found = self._search_chunk(position)
+        self._searched = position, found
+        return found
+
+    def _search_chunk(self, position: int) -> int | None:
         for match in _CHUNK_PATTERN.finditer(self.buffer, position, self._limit):
             if self._chunk_by_inner_length(match.start()) is not None:
                 return match.start()
@@ -377,15 +405,3 @@ class McapFile:
             channel_id = int.from_bytes(self.buffer[record.body : record.body + 2], "little")
             return record.end if channel_id in self.definitions.channels else None
         return record.end
-
-
-def _map(path: Path) -> mmap.mmap:
-    try:
-        with path.open("rb") as stream:
-            if not path.stat().st_size:
-                raise UnreadableLog("empty_file", f"{path.name} is empty. Nothing was recorded, or the copy failed.")
-            return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-    except (OSError, ValueError) as error:
-        raise UnreadableLog(
-            "not_readable", f"{path.name} cannot be read: {error}. Check disk and permissions."
-        ) from error

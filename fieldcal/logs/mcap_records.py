@@ -182,7 +182,14 @@ def read_message_index(fields: Fields) -> tuple[int, NDArray[np.uint64]]:
     channel_id, size = fields.number(2), fields.number(4)
     if size % _INDEX_ENTRY.itemsize:
         raise Damage(f"a message index of {size} bytes holds no whole number of entries")
-    return channel_id, np.frombuffer(fields.take(size), dtype=_INDEX_ENTRY)["offset"]
+    offsets = np.frombuffer(fields.take(size), dtype=_INDEX_ENTRY)["offset"]
+    _need_all_read(fields)
+    return channel_id, offsets
+
+
+def _need_all_read(fields: Fields) -> None:
+    if fields.left():
+        raise Damage(f"{fields.left()} bytes more than the record has fields")
 
 
 def read_metadata(fields: Fields) -> tuple[str, dict[str, str]]:
@@ -207,6 +214,7 @@ def read_statistics(fields: Fields) -> Statistics:
 def _check_header(fields: Fields) -> None:
     fields.text()
     fields.text()
+    _need_all_read(fields)
 
 
 def _check_message(fields: Fields) -> None:
@@ -219,13 +227,18 @@ def _check_attachment(fields: Fields) -> None:
     fields.text()
     fields.skip(fields.number(8))
     fields.skip(4)
+    _need_all_read(fields)
+
+
+def _check_metadata(fields: Fields) -> None:
+    read_metadata(fields)
+    _need_all_read(fields)
 
 
 def _check_exact(size: int) -> Callable[[Fields], None]:
     def check(fields: Fields) -> None:
         fields.skip(size)
-        if fields.left():
-            raise Damage(f"{fields.left()} bytes more than the record has fields")
+        _need_all_read(fields)
 
     return check
 
@@ -238,7 +251,7 @@ _DATA_SECTION: dict[int, Callable[[Fields], object]] = {
     CHUNK: read_chunk_head,
     MESSAGE_INDEX: read_message_index,
     ATTACHMENT: _check_attachment,
-    METADATA: read_metadata,
+    METADATA: _check_metadata,
     DATA_END: _check_exact(4),
     FOOTER: _check_exact(20),
 }
@@ -252,6 +265,13 @@ def check_record(buffer: Buffer, record: Record) -> None:
     if check is None:
         raise Damage(f"record {record.opcode:#04x} at byte {record.start} does not belong there")
     check(Fields(buffer, record.body, record.end))
+
+
+def check_first_record(buffer: Buffer, head: ChunkHead) -> None:
+    """Raise Damage unless an uncompressed chunk's content begins with a record that may stand in a chunk."""
+    record = read_record(buffer, head.start, head.end)
+    if record.opcode not in (SCHEMA, CHANNEL, MESSAGE) and record.opcode < FIRST_PRIVATE_OPCODE:
+        raise Damage(f"record {record.opcode:#04x} does not belong into a chunk")
 
 
 def gather(data: NDArray[np.uint8], offsets: NDArray[np.int64], dtype: np.dtype, count: int = 1) -> NDArray:  # type: ignore[type-arg]

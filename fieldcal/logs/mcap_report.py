@@ -37,7 +37,7 @@ class Definitions:
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    redefined: list[str] = field(default_factory=list)
+    redefined: dict[str, None] = field(default_factory=dict)
 
     def add(self, definition: Schema | Channel) -> None:
         """Take a definition, identical repetitions included."""
@@ -47,8 +47,15 @@ class Definitions:
         else:
             known = self.channels.setdefault(definition.channel_id, definition)
             what = f"channel {definition.channel_id} ({definition.topic})"
-        if known != definition and what not in self.redefined:
-            self.redefined.append(what)
+        if known != definition:
+            self.redefined[what] = None
+
+    def by_topic(self) -> dict[str, list[Channel]]:
+        """Topic → its channels."""
+        topics: dict[str, list[Channel]] = {}
+        for channel in self.channels.values():
+            topics.setdefault(channel.topic, []).append(channel)
+        return topics
 
 
 def report(
@@ -76,7 +83,7 @@ def report(
             loses_data=not complete,
         )
     if tally.stopped:
-        summary.add("decompressed_cap", 1, f"{name}: {tally.stopped}; the rest was not read.", loses_data=True)
+        summary.add("search_cap", 1, f"{name}: {tally.stopped}; the rest was not read.", loses_data=True)
     elif not tally.ended and not complete:
         summary.add(
             "truncated",
@@ -133,8 +140,8 @@ def _report_contradictions(name: str, tally: Tally, definitions: Definitions, su
         summary.add(
             "channel_redefined",
             len(definitions.redefined),
-            f"{name} defines {', '.join(definitions.redefined[:5])} twice and differently: what its messages mean is "
-            "uncertain. Record the log again, or split it where the definition changes.",
+            f"{name} defines {', '.join([*definitions.redefined][:5])} twice and differently: what its messages mean "
+            "is uncertain. Record the log again, or split it where the definition changes.",
             fatal=True,
         )
     if tally.unverifiable:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -111,7 +111,7 @@ def choose_sources(definitions: Definitions, mapping: Any, summary: LogSummary, 
 
 
 def _configured(role: str, topic: str, fields: Mapping[str, Any], definitions: Definitions, log_name: str) -> Source:
-    channels = [channel for channel in definitions.channels.values() if channel.topic == topic]
+    channels = definitions.by_topic().get(topic)
     if not channels:
         raise UnreadableLog(
             "missing_topic",
@@ -127,7 +127,7 @@ def _configured(role: str, topic: str, fields: Mapping[str, Any], definitions: D
             + (". Name its fields in mcap.imu_fields." if role == "imu" else "."),
         )
     try:
-        decoders = {channel.channel_id: _decoder(channel, definitions, wants) for channel in channels}
+        decoders = _decoders(channels, definitions, wants)
     except MissingField as error:
         listed = ", ".join(error.available[:30])
         raise UnreadableLog(
@@ -147,14 +147,13 @@ def _by_type(
     candidates: dict[str, Source] = {}
     ranks: dict[str, tuple[int, bool, str]] = {}
     order = [*KNOWN_TYPES[role]]
-    for topic in sorted({channel.topic for channel in definitions.channels.values()}):
-        channels = [channel for channel in definitions.channels.values() if channel.topic == topic]
+    for topic, channels in sorted(definitions.by_topic().items()):
         type_name = _type_name(channels[0], definitions)
         wants = _wants(role, type_name, fields)
         if wants is None:
             continue
         try:
-            decoders = {channel.channel_id: _decoder(channel, definitions, wants) for channel in channels}
+            decoders = _decoders(channels, definitions, wants)
         except (MissingField, UnsupportedSchema) as error:
             if type_name in order:
                 summary.add("unsupported_schema", 1, f"{log_name}: topic {topic} ({type_name}) is not read: {error}.")
@@ -185,6 +184,18 @@ def _wants(role: str, type_name: str, fields: Mapping[str, Any]) -> Mapping[str,
 def _type_name(channel: Channel, definitions: Definitions) -> str:
     schema = definitions.schemas.get(channel.schema_id)
     return short_name(schema.name) if schema else ""
+
+
+def _decoders(
+    channels: Sequence[Channel], definitions: Definitions, wants: Mapping[str, Want]
+) -> dict[int, Decoder]:
+    """Channel id → decoder; channels of one schema and encoding share theirs."""
+    shared: dict[tuple[int, str], Decoder] = {}
+    for channel in channels:
+        kind = channel.schema_id, channel.message_encoding
+        if kind not in shared:
+            shared[kind] = _decoder(channel, definitions, wants)
+    return {channel.channel_id: shared[channel.schema_id, channel.message_encoding] for channel in channels}
 
 
 def _decoder(channel: Channel, definitions: Definitions, wants: Mapping[str, Want]) -> Decoder:

@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 
 from fieldcal.logs.mcap_records import (
     CHANNEL,
+    DATA_END,
     DATA_END_BYTES,
     FOOTER,
     FOOTER_BYTES,
+    HEAD_BYTES,
     MAGIC,
     SCHEMA,
     STATISTICS,
@@ -26,6 +28,8 @@ from fieldcal.logs.mcap_records import (
 from fieldcal.logs.mcap_report import Definitions
 
 _CRC_BYTES = 4
+_DATA_END_HEAD = bytes([DATA_END]) + (DATA_END_BYTES - HEAD_BYTES).to_bytes(8, "little")
+_DATA_ENDS_TRIED = 8
 
 
 @dataclass
@@ -35,6 +39,19 @@ class Summary:
     start: int
     definitions: Definitions = field(default_factory=Definitions)
     statistics: Statistics | None = None
+
+
+def _moved(buffer: Buffer, footer: int, crc: int) -> int | None:
+    """Where the summary begins in a file that lost or gained bytes before it: behind a data end, its CRC says so."""
+    position = footer
+    for _ in range(_DATA_ENDS_TRIED):
+        position = buffer.rfind(_DATA_END_HEAD, 0, position) if crc and not isinstance(buffer, memoryview) else -1
+        if position < 0:
+            return None
+        start = position + DATA_END_BYTES
+        if start <= footer and zlib.crc32(buffer[start : footer + FOOTER_BYTES - _CRC_BYTES]) == crc:
+            return start
+    return None
 
 
 def ends_whole(buffer: Buffer) -> bool:
@@ -54,10 +71,12 @@ def read_summary(buffer: Buffer) -> Summary | None:
     start, _, crc = fields.number(8), fields.number(8), fields.number(4)
     if start == 0:
         return None
-    if not len(MAGIC) + DATA_END_BYTES <= start <= footer:
-        raise Damage(f"the footer places the summary at byte {start}")
-    if crc and zlib.crc32(buffer[start : footer + FOOTER_BYTES - _CRC_BYTES]) != crc:
-        raise Damage("the summary's CRC does not match")
+    placed = len(MAGIC) + DATA_END_BYTES <= start <= footer
+    if not placed or (crc and zlib.crc32(buffer[start : footer + FOOTER_BYTES - _CRC_BYTES]) != crc):
+        moved = _moved(buffer, footer, crc)
+        if moved is None:
+            raise Damage("the summary's CRC does not match" if placed else f"the footer places it at byte {start}")
+        start = moved
     summary, position = Summary(start), start
     while position < footer:
         record = read_record(buffer, position, footer)

@@ -10,8 +10,9 @@ import polars as pl
 from fieldcal import attitude as wahba
 from fieldcal import sensor
 from fieldcal.frames import QUATERNION, columns_of, constants, matrix, triad
-from fieldcal.results import StageResult
+from fieldcal.results import StageResult, fault_rows
 from fieldcal.rotation import Array, from_matrix, multiply
+from fieldcal.sensor_sanity import Fault
 from fieldcal.stages.inputs import Settings, Tables, spread_of
 
 VECTOR_SENSORS = ("magnetometer", "accelerometer")
@@ -108,20 +109,22 @@ def estimate_attitude(tables: Tables, s: Settings) -> StageResult:
         "taste_median": float(np.median(fit.taste)),
     }
     if scatter > MAX_DIP_SCATTER_DEG:
-        return StageResult(
-            status="refused",
-            reason_code="vectors_contradict",
-            reason=f"The angle between magnetic field and gravity scatters by {scatter:.1f}° where it should be one"
+        return _contradiction(
+            "vectors_contradict",
+            scatter,
+            MAX_DIP_SCATTER_DEG,
+            f"The angle between magnetic field and gravity scatters by {scatter:.1f}° where it should be one"
             " number: a wrong polarity, swapped axes, or a magnet on board.",
-            measured=measured,
+            measured,
         )
     if abs(expected_dip) > 20.0 and abs(measured["dip_deg"] + expected_dip) < 15.0:
-        return StageResult(
-            status="refused",
-            reason_code="gravity_sign_contradiction",
-            reason=f"The sensed field dips by {measured['dip_deg']:.0f}° where {expected_dip:.0f}° is configured:"
+        return _contradiction(
+            "gravity_sign_contradiction",
+            measured["dip_deg"],
+            expected_dip,
+            f"The sensed field dips by {measured['dip_deg']:.0f}° where {expected_dip:.0f}° is configured:"
             f' gravity_sign "{s["gravity_sign"]}" (or the polarity of a whole triad) is the wrong way round.',
-            measured=measured,
+            measured,
         )
     table = pl.DataFrame(
         {
@@ -138,6 +141,12 @@ def estimate_attitude(tables: Tables, s: Settings) -> StageResult:
     code = "logged_values_used" if fallback else None
     reason = f"Logged values stand in for the refused {' and '.join(fallback)}." if fallback else None
     return StageResult({"attitude": table}, "ok", code, reason, measured)
+
+
+def _contradiction(code: str, number: float, limit: float, reason: str, measured: dict[str, object]) -> StageResult:
+    """A refusal that puts both vector triads in question: which of them is wrong cannot be told."""
+    rows = [Fault(name, "", code, number, limit, True, reason) for name in VECTOR_SENSORS]
+    return StageResult({"faults": fault_rows(rows)}, "refused", code, reason, measured)
 
 
 def _dip_deg(vectors: Array) -> Array:

@@ -24,7 +24,7 @@ from fieldcal.frames import (
 from fieldcal.joint import JointFit, fit_joint
 from fieldcal.joint_covariance import advice
 from fieldcal.joint_model import Readings
-from fieldcal.results import StageResult, triad_rows
+from fieldcal.results import StageResult, fatal_fault, triad_rows
 from fieldcal.rotation import Array, from_matrix, multiply
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Settings, Tables, mean_temperature, reference_reading, refusal
@@ -98,7 +98,8 @@ def _held_out(
 
 
 def readings_of(tables: Tables, s: Settings) -> Readings:
-    """Logged readings of the used segments; a slow magnetometer's only at the samples nearest to its own stamps."""
+    """Logged readings of the used segments; a slow magnetometer's only at the samples nearest to its
+    own stamps; none of a triad with a fatal fault."""
     samples = tables["samples"]
     t = seconds(samples["t_ns"], samples["t_ns"][0])
     segment = samples["segment"].to_numpy()
@@ -111,7 +112,8 @@ def readings_of(tables: Tables, s: Settings) -> Readings:
         nearest = np.where(at - t[after - 1] < t[after] - at, after - 1, after)
         own[nearest[np.abs(t[nearest] - at) < 2.0 * float(np.median(np.diff(t)))]] = True
         logged["magnetometer"] = np.where(own[:, None], logged["magnetometer"], np.nan)
-    given = {name: x if np.isfinite(x).any() else None for name, x in logged.items() if name != "gyroscope"}
+    sound = {name: "faults" not in tables or fatal_fault(tables["faults"], (name,)) is None for name in SENSORS}
+    given = {n: x if sound[n] and np.isfinite(x).any() else None for n, x in logged.items() if n != "gyroscope"}
     return Readings(
         t=t,
         segment=segment,

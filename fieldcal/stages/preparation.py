@@ -13,6 +13,11 @@ from fieldcal.results import StageResult
 from fieldcal.rotation import Array
 from fieldcal.stages.inputs import Settings, Tables
 
+SHORTEST_STRETCH = 10
+MAGNETOMETER_PAUSE_S = 0.1
+MAGNETOMETER_PAUSE = 5.0
+"""A magnetometer is interpolated over so many of its intervals, and over MAGNETOMETER_PAUSE_S, at the most."""
+
 
 def find_manoeuvre(tables: Tables, s: Settings) -> StageResult:
     """imu → segments: the stretches worth calibrating on, and why."""
@@ -75,8 +80,7 @@ def smooth(tables: Tables, s: Settings) -> StageResult:
         [matrix(imu, triad("gyroscope") + triad("accelerometer")), _magnetometer_at(tables, stamps)]
     )
     parts: list[dict[str, Any]] = []
-    for number, start, end in segments.select("segment", "start_ns", "end_ns").iter_rows():
-        rows = slice(int(np.searchsorted(stamps, start)), int(np.searchsorted(stamps, end, side="right")))
+    for number, rows in _whole_stretches(segments, stamps, logged):
         x = logged[rows]
         t = (stamps[rows] - origin) * 1e-9
         smoothed = np.full_like(x, np.nan)
@@ -85,6 +89,8 @@ def smooth(tables: Tables, s: Settings) -> StageResult:
             t, x[:, known], s["smoothing_cutoff_hz"], side_s=s["smoothing_side_s"], ends=s["smoothing_ends"]
         )
         parts.append({"t_ns": stamps[rows], "segment": np.full(len(x), number, dtype=np.int32), "x": x, "s": smoothed})
+    if not parts:
+        return StageResult(status="refused", reason_code="no_manoeuvre", reason="The magnetometer pauses throughout.")
     joined = {k: np.concatenate([p[k] for p in parts]) for k in ("t_ns", "segment", "x", "s")}
     names = triad("gyroscope") + triad("accelerometer") + triad("magnetometer")
     samples = pl.DataFrame(
@@ -98,8 +104,28 @@ def smooth(tables: Tables, s: Settings) -> StageResult:
     return StageResult({"samples": samples}, measured={"n_samples": len(samples)})
 
 
+def _whole_stretches(segments: pl.DataFrame, stamps: np.ndarray, logged: Array) -> list[tuple[int, slice]]:
+    """Number and rows of each used segment; one in which the magnetometer pauses falls into the stretches between."""
+    found: list[tuple[int, slice]] = []
+    silent = np.asarray(np.isnan(logged[:, 6:]).any(axis=1))
+    extra = int(segments["segment"].max()) + 1  # type: ignore[arg-type]
+    for number, start, end in segments.select("segment", "start_ns", "end_ns").iter_rows():
+        first, last = int(np.searchsorted(stamps, start)), int(np.searchsorted(stamps, end, side="right"))
+        quiet = silent[first:last]
+        if silent.all() or not quiet.any():
+            found.append((number, slice(first, last)))
+            continue
+        edges = first + np.r_[0, np.flatnonzero(quiet[1:] != quiet[:-1]) + 1, last - first]
+        for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            if not silent[a] and b - a >= SHORTEST_STRETCH:
+                found.append((number if not found or found[-1][0] != number else extra, slice(a, b)))
+                extra += 1
+    return found
+
+
 def _magnetometer_at(tables: Tables, stamps: np.ndarray) -> Array:
-    """Magnetometer at the IMU's stamps, (n, 3), linear between its own, held past its ends; NaN when there is none."""
+    """Magnetometer at the IMU's stamps, (n, 3), linear between its own, held past its ends for the length of a pause;
+    NaN in longer pauses and where there is none."""
     magnetometer = tables.get("magnetometer")
     if magnetometer is None or len(magnetometer) < 2:
         return np.full((len(stamps), 3), np.nan)
@@ -109,4 +135,11 @@ def _magnetometer_at(tables: Tables, stamps: np.ndarray) -> Array:
         return values
     origin = stamps[0]
     at, known = (stamps - origin) * 1e-9, (own - origin) * 1e-9
-    return np.column_stack([np.interp(at, known, column) for column in values.T])
+    result = np.column_stack([np.interp(at, known, column) for column in values.T])
+    longest = max(MAGNETOMETER_PAUSE_S, MAGNETOMETER_PAUSE * float(np.median(np.diff(known))))
+    right = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
+    between = (known[0] <= at) & (at <= known[-1])
+    paused = between & (known[right] - known[right - 1] > longest)
+    beyond = np.maximum(known[0] - at, at - known[-1]) > longest
+    result[(paused & ~np.isin(stamps, own)) | beyond] = np.nan
+    return result

@@ -11,7 +11,7 @@ from fieldcal import ellipsoid, manoeuvre, sensor
 from fieldcal.ellipsoid import TriadFit
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.frames import calibration_rows, constants, covariance_table, matrix, seconds, triad
-from fieldcal.results import StageResult, triad_rows
+from fieldcal.results import StageResult, fatal_fault, triad_rows
 from fieldcal.rotation import Array
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import (
@@ -211,3 +211,21 @@ def _lever_arm(samples: pl.DataFrame, rate: Array, s: Settings) -> Array:
     """Acceleration of the sensor about the centre of mass, m/s², body axes, from smoothed rates (Eq. 3)."""
     rate_dot = differentiate_by_segment(samples, rate, s["differentiation_window_s"])
     return sensor.lever_arm_acceleration(rate, rate_dot, s["lever_arm_m"])
+
+
+def judge_vectors(tables: Tables, s: Settings) -> StageResult:
+    """Both vector triads' calibrations and what the attitude found of them → calibration: a fit by length alone cannot
+    see polarity or axes, so where attitude says that they contradict each other neither is good."""
+    parts = []
+    for name in ("magnetometer", "accelerometer"):
+        if name not in tables:
+            continue
+        fault = fatal_fault(tables["faults"], (name,)) if "faults" in tables else None
+        if fault is not None:
+            code = pl.when(pl.col("status") == "ok").then(pl.lit(fault["reason_code"])).otherwise("reason_code")
+            parts.append(tables[name].with_columns(status=pl.lit("refused"), reason_code=code))
+        else:
+            parts.append(tables[name])
+    if not parts:
+        return StageResult(status="absent", reason_code="no_vectors", reason="Neither vector triad was calibrated.")
+    return StageResult({"calibration": pl.concat(parts)})

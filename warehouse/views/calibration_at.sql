@@ -1,9 +1,28 @@
--- What to fly with at a temperature: SELECT * FROM calibration_at(12.5)
+-- What to fly with at a temperature: SELECT * FROM calibration_at(12.5). sd is that of the value; the next power-up
+-- scatters about it by session_sd.
 CREATE MACRO calibration_at(temperature_degc) AS TABLE
 SELECT
     l.vehicle_id, l.imu_id, l.sensor, l.method, l.parameter, l.axis,
     l.value_at_25degc + coalesce(l.slope_per_degc, 0) * (temperature_degc - 25) AS value,
-    sqrt(l.sd ^ 2 + (coalesce(l.slope_per_degc_sd, 0) * (temperature_degc - 25)) ^ 2) AS sd,
-    l.unit, l.flight_id, l.started_at, l.source
+    sqrt(
+        greatest(
+            l.sd ^ 2 + coalesce(l.slope_per_degc_sd, 0) ^ 2
+            * ((temperature_degc - coalesce(l.best_known_degc, 25)) ^ 2 - (25 - coalesce(l.best_known_degc, 25)) ^ 2),
+            0
+        )
+    ) AS sd,
+    l.unit, l.flight_id, l.started_at, l.source, l.session_sd,
+    concat(
+        l.why,
+        CASE
+            WHEN l.slope_per_degc IS NULL THEN ' No slope on temperature.'
+            WHEN temperature_degc < l.temperature_min_degc OR temperature_degc > l.temperature_max_degc
+                THEN printf(
+                    ' %.1f degC is outside the %.1f to %.1f degC flown.',
+                    temperature_degc::DOUBLE, l.temperature_min_degc, l.temperature_max_degc
+                )
+            ELSE ''
+        END
+    ) AS why
 FROM latest_calibration AS l
 ORDER BY l.imu_id, l.sensor, l.parameter, l.axis;

@@ -1,6 +1,9 @@
--- One row an IMU, sensor, parameter and axis: the value at 25 degC, its sd and its slope. From the drift table where it
--- has a trend (source = 'drift'), else the latest value that was not refused (source = 'flight'; it is taken as it is,
--- whatever its temperature). Of several methods in a flight the most exact counts.
+-- One row an IMU, sensor, parameter and axis: the value at 25 degC, its sd and its slope, where they come from (source)
+-- and why. source = 'drift': the unit's trend as of its last flight, which draws a noisy single flight towards the history
+-- by its sd. source = 'flight': the latest value that was not refused, where there is no trend yet, or where it lies more
+-- than 5 sd off the trend: what may be the first flight after a step is never averaged away. With a slope it is
+-- brought to 25 degC, else taken as it is, whatever its temperature. sd goes with best_known_degc: var(T) = sd^2 +
+-- slope_per_degc_sd^2 ((T - best)^2 - (25 - best)^2). Of several methods in a flight the most exact counts.
 CREATE VIEW latest_calibration AS
 WITH latest AS (
     SELECT
@@ -19,16 +22,75 @@ WITH latest AS (
     FROM calibration AS c
     WHERE status = 'ok' AND value IS NOT NULL
     GROUP BY imu_id, sensor, parameter, axis
-)
+),
+beside AS (
+    SELECT
+        k.imu_id, k.sensor, k.parameter, k.axis, l, d,
+        d.value_at_25degc IS NOT NULL AND d.status <> 'insufficient' AS trend,
+        coalesce(d.slope_per_degc * (l.at_degc - 25), 0) AS warmer,
+        coalesce(d.slope_per_degc_sd, 0) AS slope_sd,
+        coalesce(d.best_known_degc, 25) AS best
+    FROM latest AS k
+    LEFT JOIN drift AS d
+        ON d.imu_id = k.imu_id AND d.sensor = k.sensor AND d.method = l.method AND d.parameter = k.parameter
+        AND d.axis = k.axis AND d.unit IS NOT DISTINCT FROM l.unit
+),
+judged AS (
+    SELECT
+        *,
+        -- A flight that the table has not seen yet, or has set aside, is measured here.
+        greatest(
+            abs(coalesce(d.last_z, 0)),
+            CASE
+                WHEN l.started_at > d.as_of THEN abs(l.value - d.value_at_25degc - warmer) / sqrt(
+                    coalesce(l.sd, 0) ^ 2 + coalesce(d.session_sd, 0) ^ 2
+                    + greatest(
+                        d.sd ^ 2 + slope_sd ^ 2 * ((coalesce(l.at_degc, best) - best) ^ 2 - (25 - best) ^ 2), 1e-300
+                    )
+                )
+                ELSE 0
+            END
+        ) AS off
+    FROM beside
+),
+chosen AS (SELECT *, trend AND NOT off > 5 AS by_trend, trend AND off > 5 AS beyond FROM judged)
 SELECT
-    l.vehicle_id, k.imu_id, k.sensor, l.method, k.parameter, k.axis,
-    coalesce(d.value_at_25degc, l.value) AS value_at_25degc,
-    CASE WHEN d.value_at_25degc IS NULL THEN l.sd ELSE d.sd END AS sd,
-    d.slope_per_degc, d.slope_per_degc_sd,
+    l.vehicle_id, imu_id, sensor, l.method, parameter, axis,
+    CASE WHEN by_trend THEN d.value_at_25degc WHEN beyond THEN l.value - warmer ELSE l.value END AS value_at_25degc,
+    CASE
+        WHEN by_trend THEN d.sd
+        WHEN beyond THEN sqrt(l.sd ^ 2 + (slope_sd * coalesce(l.at_degc - 25, 0)) ^ 2)
+        ELSE l.sd
+    END AS sd,
+    CASE WHEN trend THEN d.slope_per_degc END AS slope_per_degc,
+    CASE WHEN trend THEN d.slope_per_degc_sd END AS slope_per_degc_sd,
     l.unit, l.at_degc AS temperature_degc, l.flight_id, l.started_at,
-    CASE WHEN d.value_at_25degc IS NULL THEN 'flight' ELSE 'drift' END AS source
-FROM latest AS k
-LEFT JOIN drift AS d
-    ON d.imu_id = k.imu_id AND d.sensor = k.sensor AND d.method = l.method AND d.parameter = k.parameter
-    AND d.axis = k.axis AND d.status <> 'insufficient'
-ORDER BY k.imu_id, k.sensor, k.parameter, k.axis;
+    CASE WHEN by_trend THEN 'drift' ELSE 'flight' END AS source,
+    CASE WHEN by_trend THEN d.best_known_degc ELSE l.at_degc END AS best_known_degc,
+    CASE WHEN trend THEN d.session_sd END AS session_sd,
+    CASE WHEN trend THEN d.temperature_min_degc END AS temperature_min_degc,
+    CASE WHEN trend THEN d.temperature_max_degc END AS temperature_max_degc,
+    d.status AS drift_status,
+    CASE
+        WHEN beyond THEN printf(
+            'The latest flight is %.1f sd off the trend of %d flights: spoiled, or the first after a step. Its own value is given.',
+            off, d.n_flights
+        )
+        WHEN by_trend THEN concat(
+            'Trend of ', d.n_flights, ' flights',
+            CASE d.status
+                WHEN 'step' THEN strftime(d.change_at AT TIME ZONE 'UTC', ', after the step of %Y-%m-%d')
+                WHEN 'drifting' THEN strftime(d.as_of AT TIME ZONE 'UTC', ', drifting, as of %Y-%m-%d')
+                WHEN 'outlier' THEN ', unlike the rest of the fleet'
+                ELSE ''
+            END,
+            '.'
+        )
+        WHEN d.n_sessions IS NOT NULL THEN concat(
+            'The latest flight as it is: ', d.n_sessions, ' session', CASE WHEN d.n_sessions = 1 THEN '' ELSE 's' END,
+            ' tell no trend yet.'
+        )
+        ELSE 'The latest flight as it is: no trend was made yet.'
+    END AS why
+FROM chosen
+ORDER BY imu_id, sensor, parameter, axis;

@@ -1,0 +1,46 @@
+"""JSON: the whole model, self-explaining."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from fieldcal.constants import SENSORS, Constants, Export, Triad
+
+MODEL = (
+    "calibrated = S (raw - Z); S = scale + scale_per_degc (T - temperature_degc), Z = zero + zero_per_degc"
+    " (T - temperature_degc); sensor axes as logged"
+)
+
+
+def json_document(constants: Constants) -> Export:
+    """One JSON object."""
+    document = {
+        "model": MODEL,
+        "vehicle_id": constants.vehicle_id,
+        "imu_id": constants.imu_id,
+        "as_of": constants.as_of or None,
+        "sensors": {s: _triad(constants.triads[s]) for s in SENSORS if s in constants.triads},
+    }
+    return Export(json.dumps(document, ensure_ascii=False, indent=1, allow_nan=False) + "\n", ())
+
+
+def _triad(triad: Triad) -> dict[str, Any]:
+    arrays = ("scale", "zero", "scale_per_degc", "zero_per_degc", "scale_sd", "zero_sd")
+    return {
+        "unit": triad.unit,
+        "raw_unit": triad.logged_unit,
+        "temperature_degc": triad.temperature_degc,
+        "flown_degc": None if triad.flown_degc is None else list(triad.flown_degc),
+        **{name: _finite(getattr(triad, name)) for name in arrays},
+        "why": list(triad.why),
+    }
+
+
+def _finite(array: np.ndarray) -> Any:
+    """Nested lists; an unknown sd is null."""
+    if array.ndim > 1:
+        return [_finite(row) for row in array]
+    return [float(v) if np.isfinite(v) else None for v in array]

@@ -1,0 +1,47 @@
+"""Warm-up: what one flight says by itself of the gyroscope's zero against temperature."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fieldcal import warm_up
+from fieldcal.errors import UnusableFlight
+from fieldcal.frames import AXES, calibration_rows, matrix, seconds, triad
+from fieldcal.results import StageResult
+from fieldcal.stages.inputs import Settings, Tables
+
+METHOD, PARAMETER = "warm_up", "zero_per_degc"
+
+
+def find_warm_up(tables: Tables, s: Settings) -> StageResult:
+    """imu, temperature → calibration: slope of the gyroscope's zero, where the IMU rested while it warmed up."""
+    imu, temperature = tables["imu"], tables.get("temperature")
+    logged = matrix(imu, triad("gyroscope"))
+    if temperature is None or (temperature := temperature.drop_nulls()).is_empty() or np.isnan(logged).any():
+        return StageResult(status="absent", reason_code="no_temperature", reason="Gyroscope or temperature is missing.")
+    t = seconds(imu["t_ns"], imu["t_ns"][0])
+    warm = np.interp(t, seconds(temperature["t_ns"], imu["t_ns"][0]), temperature["temperature_degc"].to_numpy())
+    try:
+        found = warm_up.fit_warm_up(t, logged, warm, max_gap_s=s["manoeuvre_max_gap_s"])
+    except UnusableFlight as error:
+        return StageResult(
+            status="absent", reason_code=error.reason_code, reason=error.sentence, measured=error.measured
+        )
+    unit = s["units"]["gyroscope"]
+    rows = [
+        {
+            "sensor": "gyroscope",
+            "method": METHOD,
+            "parameter": PARAMETER,
+            "axis": axis,
+            "value": float(found.zero_per_degc[i]),
+            "sd": float(found.sd[i]),
+            "unit": f"({unit})/degC" if "/" in unit else f"{unit}/degC",
+            "temperature_degc": found.temperature_degc,
+            "status": "ok",
+            "reason_code": None,
+        }
+        for i, axis in enumerate(AXES)
+    ]
+    measured = {"rest_windows": found.n_windows, "span_degc": found.span_degc, "zero": found.zero.tolist()}
+    return StageResult({"calibration": calibration_rows(rows)}, measured=measured)

@@ -1,0 +1,55 @@
+"""Which flow runs are really running: each holds a lock of the operating system, which ends with its process."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+FOLDER = "prefect/running"
+
+
+@contextmanager
+def alive(root: Path) -> Iterator[None]:
+    """Within the block the flow run that this process is in counts as running, for as long as the process lives."""
+    from prefect.runtime import flow_run
+
+    run_id = flow_run.get_id()
+    if run_id is None:
+        yield
+        return
+    folder = root / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / run_id
+    unnamed = folder / f".{run_id}"
+    descriptor = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        unnamed.rename(path)  # a run is never seen without its lock
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def dead(root: Path) -> list[Path]:
+    """Marks, named by flow run id, of runs whose process died before they ended."""
+    folder = root / FOLDER
+    marks = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [mark for mark in marks if not mark.name.startswith(".") and _is_free(mark)]
+
+
+def _is_free(mark: Path) -> bool:
+    try:
+        descriptor = os.open(mark, os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+    return True

@@ -1,0 +1,41 @@
+"""The table of the night as a Prefect artifact, beside the flow run that made it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from flows.outcome import VERDICTS
+
+KEY = "fieldcal-night"
+MOST_ROWS = 500
+
+
+def keep_artifact(result: Mapping[str, Any], root: Path) -> None:
+    """Keep the logs that are not `ok` or refused something, under the night's counts. A lost server is no error."""
+    from prefect.artifacts import create_table_artifact
+
+    counts = ", ".join(f"{result[verdict]} {verdict}" for verdict in VERDICTS)
+    news = [
+        {"log": change["vehicle_id"], "what": change["kind"], "why": change["sentence"]} for change in result["changes"]
+    ]
+    rows = news + [row for log in result["logs"] for row in _rows(log)]
+    told = (
+        f"{len(result['logs'])} logs: {counts}. {result['stages_run']} stages run, {result['stages_cached']} from the "
+        f"cache. History: `{root}/tables`. Report: `{result['report']}`."
+    )
+    if len(rows) > MOST_ROWS:
+        told += f" The first {MOST_ROWS} of {len(rows)} rows; all: `fieldcal sql 'SELECT * FROM refusals'`."
+    try:
+        create_table_artifact(table=rows[:MOST_ROWS], key=KEY, description=told)
+    except Exception as error:
+        from flows.show import say
+
+        say(f"Prefect keeps no table of this night ({type(error).__name__}); the warehouse has it all.")
+
+
+def _rows(log: Mapping[str, Any]) -> list[dict[str, Any]]:
+    own = [] if log["verdict"] == "ok" else [{"what": log["verdict"], "why": log["reason"] or log["reason_code"]}]
+    refused = [{"what": f"{r['stage']} {r['status']}", "why": r["reason"] or r["reason_code"]} for r in log["refusals"]]
+    return [{"log": log["log_uri"], **row} for row in own + refused]

@@ -1,0 +1,62 @@
+"""`fieldcal drift`: the trends of calibrated parameters as the last night published them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+SHOWN = (
+    "vehicle_id",
+    "imu_id",
+    "sensor",
+    "method",
+    "parameter",
+    "axis",
+    "status",
+    "n_flights",
+    "value_at_25degc",
+    "sd",
+    "slope_per_degc",
+    "slope_per_degc_sd",
+    "slope_per_day",
+    "slope_per_day_sd",
+    "unit",
+    "last_z",
+    "fleet_z",
+    "change_at",
+    "reason",
+)
+
+
+def drift(
+    *,
+    vehicle: str | None = None,
+    sensor: Literal["magnetometer", "accelerometer", "gyroscope", "vps", "fit"] | None = None,
+    parameter: str | None = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative="", help="One JSON document on stdout.")] = False,
+    as_csv: Annotated[bool, Parameter(name="--csv", negative="", help="CSV on stdout.")] = False,
+    warehouse: Annotated[
+        Path | None, Parameter(name="--warehouse", help="Data root; else FIELDCAL_WAREHOUSE, else ./fieldcal-data.")
+    ] = None,
+    config: Annotated[Path | None, Parameter(show=False)] = None,
+) -> int:
+    """Trends of calibrated parameters over temperature and time, what is not stable first.
+
+    Parameters
+    ----------
+    vehicle
+        Only IMUs that this vehicle carries.
+    sensor
+        Only this sensor; vps: lag and skew of its clock, fit: Theil coefficients.
+    parameter
+        scale, bias, zero, zero_bias, lag, skew, tic_attitude, ...
+    """
+    from flows.drift import drift_rows
+    from flows.show import print_frame
+    from warehouse import Warehouse
+
+    rows = drift_rows(Warehouse(warehouse).root, vehicle, sensor, parameter)
+    print_frame(rows if as_json or as_csv else rows.select(SHOWN), as_json=as_json, as_csv=as_csv)
+    return 0

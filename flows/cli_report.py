@@ -1,0 +1,56 @@
+"""`fieldcal report`: fleet, vehicle or flight, one offline HTML file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+
+def report(
+    *,
+    vehicle: str | None = None,
+    flight: str | None = None,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    as_of: str | None = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative="", help="One JSON document on stdout.")] = False,
+    warehouse: Annotated[
+        Path | None, Parameter(help="Data root; else FIELDCAL_WAREHOUSE, else ./fieldcal-data.")
+    ] = None,
+    config: Annotated[Path | None, Parameter(show=False)] = None,
+) -> int:
+    """Write a report as one HTML file that needs no network: the fleet, or one vehicle, or one flight.
+
+    Parameters
+    ----------
+    vehicle
+        The page of this vehicle.
+    flight
+        The page of this flight: its id, the start of it, or its log's path in the archive.
+    output
+        File to write; else in the data root's folder reports.
+    as_of
+        Ages count to this moment, 2026-05-04 or 2026-05-04T12:00; else to the newest flight.
+    """
+    from fieldcal.errors import FieldcalError
+    from flows.ask import moment_of
+    from flows.report import fleet_report, flight_report, vehicle_report
+    from flows.show import print_json
+    from warehouse import Warehouse
+
+    if vehicle is not None and flight is not None:
+        raise FieldcalError("wrong_option", "Give --vehicle or --flight, not both: a report is of one thing.")
+    root = Warehouse(warehouse).root
+    moment = None if as_of is None else moment_of("--as-of", as_of)
+    if flight is not None:
+        path = flight_report(root, flight, output)
+    elif vehicle is not None:
+        path = vehicle_report(root, vehicle, output, as_of=moment)
+    else:
+        path = fleet_report(root, output, as_of=moment)
+    if as_json:
+        print_json({"path": str(path)})
+    else:
+        print(path)
+    return 0

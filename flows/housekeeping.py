@@ -1,0 +1,82 @@
+"""Keep Prefect's records true and small: runs whose process died are ended, old ones are removed."""
+
+from __future__ import annotations
+
+import time
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
+from uuid import UUID
+
+from flows.alive import dead
+
+if TYPE_CHECKING:
+    from prefect.client.orchestration import SyncPrefectClient
+    from prefect.client.schemas.filters import FlowRunFilter
+
+KEPT_DAYS = 30
+AT_ONCE = 200
+
+
+def tidy_prefect(root: Path, url: str, *, own_server: bool) -> None:
+    """End the runs of killed processes and, on a server of ours, remove runs older than `KEPT_DAYS`."""
+    from prefect.client.orchestration import get_client
+    from prefect.settings import PREFECT_API_URL, temporary_settings
+
+    marks = dead(root)
+    if not marks and not own_server:
+        return
+    with temporary_settings({PREFECT_API_URL: url}), get_client(sync_client=True) as client:
+        for mark in marks:
+            _end(client, mark)
+        if own_server:
+            _remove_old(client)
+
+
+def _end(client: SyncPrefectClient, mark: Path) -> None:
+    """Say of a run and its tasks that they crashed, if this server knows them as running."""
+    from prefect.client.schemas.filters import (
+        FlowRunFilter,
+        FlowRunFilterId,
+        TaskRunFilter,
+        TaskRunFilterState,
+        TaskRunFilterStateType,
+    )
+    from prefect.client.schemas.objects import StateType
+    from prefect.exceptions import ObjectNotFound
+    from prefect.states import Crashed
+
+    try:
+        run_id = UUID(mark.name)
+        run = client.read_flow_run(run_id)
+    except ObjectNotFound:  # it ran on another server, which may be asked later
+        if time.time() - mark.stat().st_mtime > KEPT_DAYS * 86_400:
+            mark.unlink(missing_ok=True)
+        return
+    except ValueError:
+        mark.unlink(missing_ok=True)
+        return
+    why = "Its process was killed. What it had done is kept; the next night goes on from there."
+    open_states = TaskRunFilterState(type=TaskRunFilterStateType(any_=[StateType.RUNNING, StateType.PENDING]))
+    tasks = client.read_task_runs(
+        flow_run_filter=FlowRunFilter(id=FlowRunFilterId(any_=[run_id])),
+        task_run_filter=TaskRunFilter(state=open_states),
+        limit=AT_ONCE,
+    )
+    for task in tasks:
+        client.set_task_run_state(task.id, Crashed(message=why), force=True)
+    if run.state is None or not run.state.is_final():
+        client.set_flow_run_state(run_id, Crashed(message=why), force=True)
+    mark.unlink(missing_ok=True)
+
+
+def _remove_old(client: SyncPrefectClient) -> None:
+    for run in client.read_flow_runs(flow_run_filter=_ended_before(KEPT_DAYS), limit=AT_ONCE):
+        client.delete_flow_run(run.id)
+
+
+def _ended_before(days: float) -> FlowRunFilter:
+    from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterEndTime
+
+    before = datetime.now(UTC) - timedelta(days=days)
+    return FlowRunFilter(end_time=FlowRunFilterEndTime.model_validate({"before_": before}))

@@ -1,0 +1,102 @@
+"""Where batches of flights run: in this process, in spawned processes of this machine, on Dask, or in a work pool."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from fieldcal.errors import FieldcalError
+from flows.jobs import Job
+
+if TYPE_CHECKING:
+    from prefect import Task
+    from prefect.task_runners import TaskRunner
+
+RUNNERS = ("process", "dask", "pool")
+LARGEST_BATCH = 40
+SMALLEST_BATCH = 4
+SHARE_OF_A_WORKER = 4
+
+
+@dataclass(frozen=True)
+class Parallel:
+    """How many processes, of which kind; `scheduler` is the address of a Dask scheduler.
+
+    "pool": the deployment `batch/fieldcal` of `prefect.yaml`, whose work pool has workers on machines that see the same
+    archive and warehouse.
+    """
+
+    workers: int = 1
+    runner: str = "process"
+    scheduler: str | None = None
+
+    def in_this_process(self, n_batches: int) -> bool:
+        """Whether other processes would only cost."""
+        return self.runner == "process" and (self.workers == 1 or n_batches <= 1)
+
+
+def batches(jobs: Sequence[Job], workers: int) -> list[list[Job]]:
+    """Jobs dealt out in batches, each a quarter of a worker's share of what is left, so that all end together."""
+    smallest = min(SMALLEST_BATCH, -(-len(jobs) // workers))
+    dealt: list[list[Job]] = []
+    start = 0
+    while start < len(jobs):
+        share = -(-(len(jobs) - start) // (workers * SHARE_OF_A_WORKER))
+        size = min(LARGEST_BATCH, max(smallest, share))
+        dealt.append(list(jobs[start : start + size]))
+        start += size
+    return dealt
+
+
+def answers(
+    parallel: Parallel, task: Task[Any, dict[str, Any]], inputs: Sequence[dict[str, Any]]
+) -> Iterator[tuple[dict[str, Any], dict[str, Any] | Exception]]:
+    """Run `task` on every input, elsewhere; each input with what came back, in the order in which they end.
+
+    Raises
+    ------
+    FieldcalError
+        `wrong_option`, or there is nothing to run on (`no_dask`, `no_scheduler`, `no_deployment`).
+    """
+    if parallel.runner == "pool":
+        from flows.pool import pool_answers
+
+        yield from pool_answers(inputs)
+        return
+    from prefect.futures import as_completed
+
+    with _task_runner(parallel) as runner:
+        waiting = {runner.submit(task, given): given for given in inputs}
+        for future in as_completed(list(waiting)):
+            try:
+                answer: dict[str, Any] | Exception = future.result()
+            except Exception as error:
+                answer = error
+            yield waiting[future], answer
+
+
+def _task_runner(parallel: Parallel) -> TaskRunner[Any]:
+    if parallel.runner == "process":
+        from prefect.task_runners import ProcessPoolTaskRunner
+
+        return ProcessPoolTaskRunner(max_workers=parallel.workers)
+    if parallel.runner == "dask":
+        return _dask(parallel)
+    raise FieldcalError("wrong_option", f"runner must be one of {', '.join(RUNNERS)}, not {parallel.runner!r}.")
+
+
+def _dask(parallel: Parallel) -> TaskRunner[Any]:
+    try:
+        from distributed import Client
+        from prefect_dask.task_runners import DaskTaskRunner
+    except ImportError as error:
+        raise FieldcalError("no_dask", 'Dask is not installed: pip install "fieldcal[dask]".') from error
+    if parallel.scheduler is None:
+        return DaskTaskRunner(cluster_kwargs={"n_workers": parallel.workers, "threads_per_worker": 1})
+    try:
+        Client(parallel.scheduler, timeout="10s").close()  # type: ignore[no-untyped-call]
+    except (OSError, TimeoutError, ValueError) as error:
+        what = f"No Dask scheduler answers at {parallel.scheduler} ({error}). Start it, or mend --scheduler."
+        raise FieldcalError("no_scheduler", what) from error
+    return DaskTaskRunner(address=parallel.scheduler)

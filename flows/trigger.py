@@ -1,0 +1,106 @@
+"""Ask a Prefect server to run `session` for a finished field session: once, however often one asks."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fieldcal.errors import FieldcalError
+from flows.server import answers, no_answer, serving_address
+from warehouse.files import file_sha256
+
+if TYPE_CHECKING:
+    from prefect.client.orchestration import SyncPrefectClient
+    from prefect.client.schemas.objects import FlowRun
+
+DEPLOYMENT = "fieldcal"
+EVENT = "fieldcal.session.landed"
+UNSUCCESSFUL = ("FAILED", "CRASHED", "CANCELLED")
+MOST_TRIES = 100
+
+
+def session_digest(folder: Path) -> str:
+    """Digest of a session folder's content: every file's place in it and its sha256; links out of it do not count."""
+    inside = folder.resolve()
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*"), key=lambda path: path.relative_to(folder).as_posix()):
+        if path.is_file() and path.resolve().is_relative_to(inside):
+            digest.update(
+                f"{path.relative_to(folder).as_posix()}\0{file_sha256(path)}\0".encode("utf-8", "surrogatepass")
+            )
+    return digest.hexdigest()
+
+
+def server_address(root: Path) -> str:
+    """Where to ask: `PREFECT_API_URL`, else the server that `fieldcal serve` started for this data root.
+
+    Raises
+    ------
+    FieldcalError
+        `prefect_unavailable`: none is known, or it does not answer.
+    """
+    if url := os.environ.get("PREFECT_API_URL"):
+        if not answers(url):
+            raise FieldcalError("prefect_unavailable", no_answer(url))
+        return url
+    own = serving_address(root)
+    if own is None or not answers(own):
+        raise FieldcalError(
+            "prefect_unavailable",
+            f"No server runs for the warehouse {root}: start `fieldcal serve`, or set PREFECT_API_URL. The session is "
+            "not lost: the next night takes it, and `fieldcal session` runs it now.",
+        )
+    return own
+
+
+def trigger(url: str, folder: Path, **changes: Any) -> dict[str, Any]:
+    """Create the flow run of a session, unless there is one for the same content already.
+
+    A run that failed is followed by a new one. `changes` overrule parameters of the deployment.
+
+    Returns
+    -------
+    dict
+        `flow_run_id`, `name`, `state`, `created` (False: it had been asked for before), `digest`.
+
+    Raises
+    ------
+    FieldcalError
+        `no_deployment`: nobody hosts the flow on this server.
+    """
+    from prefect.client.orchestration import get_client
+    from prefect.exceptions import ObjectNotFound
+    from prefect.settings import PREFECT_API_URL, temporary_settings
+
+    digest = session_digest(folder)
+    with temporary_settings({PREFECT_API_URL: url}), get_client(sync_client=True) as client:
+        try:
+            deployment = client.read_deployment_by_name(f"session/{DEPLOYMENT}")
+        except ObjectNotFound as error:
+            raise FieldcalError(
+                "no_deployment",
+                f"The server at {url} has no deployment session/{DEPLOYMENT}: start `fieldcal serve` there, or deploy "
+                "prefect.yaml.",
+            ) from error
+        run, created = _run_for(client, deployment.id, digest, {"folder": str(folder), **changes})
+        state = run.state.name if run.state else "Scheduled"
+        return {"flow_run_id": str(run.id), "name": run.name, "state": state, "created": created, "digest": digest}
+
+
+def _run_for(
+    client: SyncPrefectClient, deployment: Any, digest: str, parameters: dict[str, Any]
+) -> tuple[FlowRun, bool]:
+    """The run with this digest as idempotency key, and whether it is new; after one that failed, the next try's."""
+    from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterIdempotencyKey
+
+    for number in range(1, MOST_TRIES + 1):
+        key = digest if number == 1 else f"{digest}-{number}"
+        asked = FlowRunFilter(idempotency_key=FlowRunFilterIdempotencyKey(any_=[key]))
+        before = client.read_flow_runs(flow_run_filter=asked, limit=1)
+        if before and before[0].state_type is not None and before[0].state_type.value in UNSUCCESSFUL:
+            continue
+        run = client.create_flow_run_from_deployment(deployment, parameters=parameters, idempotency_key=key)
+        return run, not before
+    raise FieldcalError("session_fails", f"{MOST_TRIES} runs of this session failed; look at them on the server.")

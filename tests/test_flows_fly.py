@@ -1,0 +1,160 @@
+"""`fieldcal export` and `fieldcal apply` on a simulated vehicle whose calibration is in a warehouse."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from mcap_ros2.reader import read_ros2_messages
+
+from fieldcal import ingest
+from fieldcal.configuration import load
+from fieldcal.frames import matrix, triad
+from fieldcal.logs import log_sha256
+from fieldcal.rotation import FRD_FROM_FLU
+from fieldcal.simulate import Experiment
+from fieldcal.simulate_logs import write_flights
+from flows.calibrate import calibrate_log
+from flows.cli import run
+from flows.fly import constants_of
+from warehouse.publish import publish
+from warehouse.store import empty_frame
+
+EQUAL = 1e-9
+ROUNDING = 1e-12
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    archive = tmp_path_factory.mktemp("fly") / "archive"
+    return write_flights(archive, Experiment(seed=8, duration_s=25.0, temperature_degc=(20.0, 24.0)))[0]
+
+
+@pytest.fixture(scope="module")
+def root(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The flight's calibration, and another axis of it for what a full matrix would leave behind."""
+    root = tmp_path_factory.mktemp("fly") / "warehouse"
+    document = calibrate_log(log)
+    lead = {k: document["flight"][k] for k in ("flight_id", "vehicle_id", "imu_id", "session_id", "started_at")}
+    rows = [{**row, **lead} for row in document["calibration"]]
+    schema = empty_frame("calibration").schema
+    frame = pl.DataFrame(rows, schema=schema, strict=False)
+    publish(root, lead["vehicle_id"], {"calibration": frame}, [lead["flight_id"]])
+    return root
+
+
+@pytest.fixture(scope="module")
+def wanted(log: Path, root: Path) -> dict[str, np.ndarray]:
+    """Eq. 5 by hand: scale · counts + bias with the flight's own constants."""
+    signals, _ = ingest.read_flight(log, load(log.parents[2] / "fieldcal.toml").vehicle("sim-1"))
+    document = calibrate_log(log)
+    rows = {(r["sensor"], r["parameter"], r["axis"], r["method"]): r["value"] for r in document["calibration"]}
+    methods = {"gyroscope": "output_error", "accelerometer": "ellipsoid_robust", "magnetometer": "ellipsoid_robust"}
+    result = {}
+    for sensor, method in methods.items():
+        scale, bias = (np.array([rows[sensor, p, axis, method] for axis in "xyz"]) for p in ("scale", "bias"))
+        table = signals["magnetometer" if sensor == "magnetometer" else "imu"]
+        result[sensor] = scale * matrix(table, triad(sensor)) + bias
+    return result
+
+
+def same(found: np.ndarray, other: np.ndarray) -> bool:
+    return bool(np.abs(found - other).max() <= EQUAL * np.abs(other).max())
+
+
+def test_parquet_is_eq_5(log: Path, root: Path, wanted: dict[str, np.ndarray], tmp_path: Path) -> None:
+    before = log_sha256(log)
+    assert run(["apply", str(log), "-o", str(tmp_path / "out"), "--warehouse", str(root)]) == 0
+    imu, magnetometer = (pl.read_parquet(tmp_path / "out" / f"{name}.parquet") for name in ("imu", "magnetometer"))
+    for sensor, values in wanted.items():
+        assert same(matrix(magnetometer if sensor == "magnetometer" else imu, triad(sensor)), values)
+    facts = pl.read_parquet_metadata(tmp_path / "out" / "imu.parquet")
+    assert facts["vehicle_id"] == "sim-1"
+    assert log_sha256(log) == before
+
+
+def test_mcap_is_rep_103(log: Path, root: Path, wanted: dict[str, np.ndarray], tmp_path: Path) -> None:
+    """Read by another decoder: forward-left-up, specific force (+g up at rest), rates the same rotation."""
+    path = tmp_path / "out.mcap"
+    assert run(["apply", str(log), "-o", str(path), "--warehouse", str(root)]) == 0
+    imu: list[Any] = [m.ros_msg for m in read_ros2_messages(str(path), topics=["/imu/data"])]
+    rate, force = (
+        np.array([[v.x, v.y, v.z] for v in (getattr(m, name) for m in imu)])
+        for name in ("angular_velocity", "linear_acceleration")
+    )
+    assert same(rate, wanted["gyroscope"] @ FRD_FROM_FLU)
+    assert same(force, -wanted["accelerometer"] @ FRD_FROM_FLU)
+    assert np.median(force[:, 2]) > 0.8 * 9.81
+    assert imu[0].orientation_covariance[0] == -1.0
+    field = [m.ros_msg.magnetic_field for m in read_ros2_messages(str(path), topics=["/imu/mag_norm"])]
+    assert same(np.array([[v.x, v.y, v.z] for v in field]), wanted["magnetometer"] @ FRD_FROM_FLU)
+    assert not list(tmp_path.glob("*.part"))
+
+
+@pytest.mark.parametrize("form", ["px4", "ardupilot", "ros", "kalibr", "json", "c"])
+def test_export_says_what_it_cannot_hold(
+    form: str, root: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    capsys.readouterr()
+    assert run(["export", "sim-1", "--format", form, "--warehouse", str(root)]) == 0
+    told = capsys.readouterr()
+    assert told.out
+    assert ("in counts" in told.err) == (form in ("px4", "ardupilot"))
+    assert run(["export", "sim-1", "-f", form, "-o", str(tmp_path / "x"), "--warehouse", str(root)]) == 0
+    assert (tmp_path / "x").read_text() == told.out
+
+
+def test_json_export_gives_what_apply_gives(
+    log: Path, root: Path, wanted: dict[str, np.ndarray], capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    assert run(["export", "sim-1", "--warehouse", str(root)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    signals, _ = ingest.read_flight(log, load(log.parents[2] / "fieldcal.toml").vehicle("sim-1"))
+    for sensor, values in wanted.items():
+        constants = document["sensors"][sensor]
+        raw = matrix(signals["magnetometer" if sensor == "magnetometer" else "imu"], triad(sensor))
+        assert same((raw - np.array(constants["zero"])) @ np.array(constants["scale"]).T, values)
+        assert constants["raw_unit"] == "counts"
+    assert document["sensors"]["gyroscope"]["unit"] == "rad/s"
+    assert document["sensors"]["accelerometer"]["unit"] == "m/s^2"
+    assert document["sensors"]["magnetometer"]["unit"] == "norm"
+    assert "no trend" in document["sensors"]["gyroscope"]["why"][0]
+
+
+def test_a_temperature_slope_is_applied_sample_by_sample(root: Path) -> None:
+    t = constants_of(root, "sim-1").triads["gyroscope"]
+    sloped = replace(t, zero_per_degc=np.array([1.0, 2.0, 3.0]), scale_per_degc=1e-3 * t.scale)
+    raw = np.full((3, 3), 30000.0)
+    found = sloped.apply(raw, np.array([25.0, 35.0, np.nan]))
+    assert found[0] == pytest.approx(t.apply(raw)[0], rel=ROUNDING)
+    assert found[2] == pytest.approx(t.apply(raw)[2], rel=ROUNDING)
+    by_hand = 1.01 * np.diagonal(t.scale) * (raw[1] - t.zero - np.array([10.0, 20.0, 30.0]))
+    assert found[1] == pytest.approx(by_hand, rel=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("tokens", "code", "part"),
+    [
+        (["apply", "{log}", "-o", "{log}"], 2, "only ever read"),
+        (["apply", "{log}.none", "-o", "{out}"], 2, "There is no log"),
+        (["apply", "{log}", "-o", "{out}", "--vehicle", "other"], 1, "No calibration of vehicle 'other'"),
+        (["export", "other"], 1, "there is: sim-1"),
+    ],
+)
+def test_mistakes_are_explained(
+    tokens: list[str], code: int, part: str, log: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = log_sha256(log)
+    capsys.readouterr()
+    full = [token.format(log=log, out=tmp_path / "out") for token in tokens]
+    assert run([*full, "--warehouse", str(root)]) == code
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert part in told.err
+    assert log_sha256(log) == before

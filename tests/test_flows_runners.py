@@ -1,0 +1,122 @@
+"""Where the batches run makes no difference: processes, a Dask cluster, any order of files, hash seed and time zone."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from distributed import LocalCluster
+
+from fieldcal.errors import FieldcalError
+from fieldcal.simulate import Experiment
+from fieldcal.simulate_logs import write_flights
+from flows.jobs import Job
+from flows.night import run_night
+from flows.pool import hand_over
+from flows.runners import LARGEST_BATCH, Parallel, batches
+from flows.steps import STEPS
+from warehouse.content import content_sha256
+
+REPOSITORY = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runners") / "archive"
+    write_flights(folder, Experiment(seed=6, duration_s=20.0), vehicles=2, flights=3)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def content(archive: Path, tmp_path_factory: pytest.TempPathFactory, prefect_server: str) -> str:
+    """What one process makes of the archive."""
+    root = tmp_path_factory.mktemp("one") / "warehouse"
+    assert run_night(archive, root)["ok"] == 6
+    return content_sha256(root)
+
+
+@pytest.fixture
+def cluster() -> Iterator[LocalCluster]:
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, silence_logs=50
+    ) as own:
+        yield own
+
+
+def test_a_dask_cluster_gives_the_same(archive: Path, content: str, tmp_path: Path, cluster: LocalCluster) -> None:
+    where = {"runner": "dask", "scheduler": cluster.scheduler_address}
+    result = run_night(archive, tmp_path, None, None, 2, **where)
+    assert (result["ok"], result["stages_run"]) == (6, 6 * len(STEPS))
+    assert content_sha256(tmp_path) == content
+    with cluster.get_client() as client:
+        worked = client.run(lambda: "flows.nightly" in sys.modules)
+    assert list(worked.values()) == [True, True]
+
+
+def test_a_missing_scheduler_is_told(archive: Path, tmp_path: Path, prefect_server: str) -> None:
+    with pytest.raises(FieldcalError, match=r"No Dask scheduler answers at tcp://127\.0\.0\.1:9"):
+        run_night(archive, tmp_path, None, None, 2, runner="dask", scheduler="tcp://127.0.0.1:9")
+
+
+def test_a_missing_work_pool_is_told(archive: Path, tmp_path: Path, prefect_server: str) -> None:
+    with pytest.raises(FieldcalError, match="prefect deploy"):
+        run_night(archive, tmp_path, None, None, 2, runner="pool")
+
+
+@pytest.mark.parametrize(("workers", "seed", "zone"), [("2", "1", "Asia/Tokyo"), ("4", "0", "America/New_York")])
+def test_workers_order_seed_and_time_zone_make_no_difference(
+    archive: Path, content: str, tmp_path: Path, workers: str, seed: str, zone: str
+) -> None:
+    shuffled = tmp_path / "archive"
+    for path in sorted(archive.rglob("*"), key=lambda path: path.name, reverse=True):
+        if path.is_file():
+            target = shuffled / path.relative_to(archive)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(path.read_bytes())
+    at = ("--warehouse", str(tmp_path / "w"))
+    subprocess.run(
+        [sys.executable, "-m", "flows.cli", "nightly", str(shuffled), *at, "--workers", workers],
+        cwd=REPOSITORY,
+        env={**os.environ, "PYTHONHASHSEED": seed, "TZ": zone},
+        capture_output=True,
+        check=True,
+    )
+    assert content_sha256(tmp_path / "w") == content
+
+
+def job(number: int) -> Job:
+    return Job(f"/a/{number}", f"v/s/{number}", "v", "s", "mcap", None, f"{number:016x}")
+
+
+@pytest.mark.parametrize(("n_jobs", "workers"), [(0, 2), (1, 1), (3, 2), (200, 2), (1000, 4), (500, 1)])
+def test_batches_hold_every_job_once_and_shrink(n_jobs: int, workers: int) -> None:
+    jobs = [job(number) for number in range(n_jobs)]
+    dealt = batches(jobs, workers)
+    sizes = [len(batch) for batch in dealt]
+    assert [one for batch in dealt for one in batch] == jobs
+    assert sizes == sorted(sizes, reverse=True)
+    assert max(sizes, default=0) <= LARGEST_BATCH
+    if n_jobs > 4 * workers:
+        assert sizes[-1] <= 4
+
+
+def test_small_nights_stay_in_this_process() -> None:
+    assert Parallel(1).in_this_process(50)
+    assert Parallel(4).in_this_process(1)
+    assert not Parallel(2).in_this_process(2)
+    assert not Parallel(1, "dask").in_this_process(1)
+
+
+def test_an_answer_of_the_pool_is_read_once_and_whole(tmp_path: Path) -> None:
+    from flows.pool import _place, _taken
+
+    hand_over(tmp_path, "a", {"outcomes": [], "error": None})
+    assert _taken(tmp_path, "a", "Completed") == {"outcomes": [], "error": None}
+    assert isinstance(_taken(tmp_path, "a", "Completed"), FieldcalError)
+    hand_over(tmp_path, "b", {"outcomes": [], "error": None})
+    _place(tmp_path, "b").write_bytes(_place(tmp_path, "b").read_bytes().replace(b"[]", b"{}"))
+    assert isinstance(_taken(tmp_path, "b", "Completed"), FieldcalError)
