@@ -207,7 +207,7 @@ PIPELINE: tuple[Stage, ...] = (
             "accelerometer": "accelerometer_pass2.calibration",
             "gyroscope": "gyro_output.calibration",
         },
-        ("samples",),
+        (),
         ("calibration", "covariance", "attitude", "held_out"),
         (
             *AXES,
@@ -225,7 +225,6 @@ PIPELINE: tuple[Stage, ...] = (
             "ellipsoid_max_residual",
             "gyro_max_scale_sd",
         ),
-        ("gyroscope",),
     ),
     Stage(
         "vps_sync",

@@ -19,6 +19,8 @@ LEVER_ARM_M = (0.05, 0.02, -0.03)
 MOVING = {"translation_rms_mps2": 0.3, "lever_arm_m": LEVER_ARM_M}
 # The rate is taken as linear between samples, readings are averaged over three of them, turns bend the truth in both.
 DISCRETISATION = 5e-4
+# Gyroscope noise in the low-passed rates draws the arm towards zero: a third of its length at the worst.
+LEVER_ARM_ERROR_M = 0.02
 SEEDS = (11, 12, 13, 14, 15, 16)
 
 
@@ -95,7 +97,7 @@ def test_translation_and_an_unknown_lever_arm_cost_little(moving: list[tuple[Rec
         assert np.median([rms(relative_errors(r, fit, name)) for r, fit in moving]) < bar, name
     assert np.median([np.degrees(rms(angle_between(fit.path.q, r.q))) for r, fit in moving]) < 0.9
     for _, fit in moving:
-        assert np.abs(fit.state.values["lever_arm"] - LEVER_ARM_M).max() < 0.01
+        assert np.abs(fit.state.values["lever_arm"] - LEVER_ARM_M).max() < LEVER_ARM_ERROR_M
 
 
 def test_claimed_standard_deviations_are_honest(moving: list[tuple[Recording, JointFit]]) -> None:

@@ -47,8 +47,12 @@ def estimate_jointly(tables: Tables, s: Settings) -> StageResult:
     """samples, serial constants → calibration, attitude, covariance, fit: everything in one likelihood."""
     if s["method"] != METHOD:
         return StageResult(status="absent", reason_code="not_selected", reason='The method is "serial".')
-    samples = tables["samples"]
-    if samples["gyroscope_x"].null_count():
+    if "samples" not in tables:
+        return StageResult(status="refused", reason_code="no_samples", reason="No segment of the log is usable.")
+    fault = fatal_fault(tables["faults"], ("gyroscope",)) if "faults" in tables else None
+    if fault is not None:
+        return StageResult(status="refused", reason_code=fault["reason_code"], reason=fault["reason"])
+    if tables["samples"]["gyroscope_x"].null_count():
         return StageResult(status="refused", reason_code="no_gyroscope", reason="The joint estimate needs a gyroscope.")
     readings = readings_of(tables, s)
     axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
