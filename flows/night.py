@@ -25,8 +25,8 @@ def run_night(
 ) -> dict[str, Any]:
     """Run the flow `nightly`, or `session` for that folder of the archive; its JSON, with how long it took.
 
-    `where` may hold `runner` and `scheduler` (`flows.runners`). `seconds` is the whole duration; of it, `server_seconds`
-    went into importing Prefect until its server answered. `stage_seconds` is the stages' own work, summed over workers.
+    `where` may hold `runner` and `scheduler` (`flows.runners`). `seconds` is the whole duration, `server_seconds` what
+    importing Prefect took until its server answered, `stage_seconds` the stages' own work, summed over the workers.
     """
     began = time.monotonic()
     find_source(config, archive)
