@@ -212,8 +212,10 @@ def judged(table: pl.DataFrame, fleet: Fleet) -> dict[str, Any]:
     step = row(STEP_UNIT, "x")
     others = calibrated.filter(~pl.col("unit").is_in([STEP_UNIT, DRIFTING_UNIT, OUTLIER_UNIT]))
     late = None if step["change_at"] is None else (step["change_at"] - START).days / 7 - STEP_SESSION
+    last_word = (gyro["method"] == "output_error").to_numpy()
     return {
         "slopes within 5 % or 3 sd": float(within.mean()),
+        "of output error": float(within[last_word].mean()),
         "error / sd of slopes, rms": float(np.sqrt(np.nanmean((error / sd) ** 2))),
         "median error of slopes": float(np.median(np.abs(error / truth))),
         "step named": step["status"] == "step",
@@ -239,7 +241,7 @@ def as_rows(seeds: int) -> None:
     size = np.array([f["step size off by"] for f in found if f["step size off by"] is not None])
     late = np.array([f["step late by sessions"] for f in found if f["step late by sessions"] is not None])
     print(f"{seeds} fleets of {UNITS} units x {SESSIONS} sessions, 48 rows a unit, as rows of the history")
-    for name in ("slopes within 5 % or 3 sd", "step named", "drifting named", "outlier named"):
+    for name in ("slopes within 5 % or 3 sd", "of output error", "step named", "drifting named", "outlier named"):
         print(f"  {name:32s} {np.mean([f[name] for f in found]):.4f}")
     print(f"  {'step within one session':32s} {np.mean(np.abs(late) <= 1):.4f}")
     sized, rms = np.mean(np.abs(size) <= SIZE_BAR), np.sqrt(np.mean(size**2))

@@ -11,8 +11,9 @@ from fieldcal.statistics import MAD_TO_SIGMA
 
 NEIGHBOURS = 2
 """A point is compared with so many before and so many after it."""
-ISOLATED_SIGMAS = 3.0
-"""Distance from every neighbour, in sd of the difference, beyond which a point stands alone."""
+ISOLATED_SIGMAS, FEW_POINTS = 3.0, 5.0
+"""Distance from every neighbour, in sd of the difference, beyond which a point stands alone: 3 (1 + (5/n)²), for the sd
+is itself found from the n points."""
 SIDE_SESSIONS = 2
 """Sessions that must lie on either side of a step: one odd session alone is not a step yet."""
 PAIR_LAGS = 3
@@ -70,7 +71,7 @@ def isolated(row: np.ndarray, residual: Array, variance: Array) -> np.ndarray:
     neighbours agree).
 
     `row` ascending, `residual` without the effect of temperature, `variance` the whole of each point. Rows with fewer
-    than five points have no isolated ones.
+    than six points have no isolated ones, and of six or seven a bad one often hides in the scatter that it makes.
     """
     n = len(row)
     nearest = np.full(n, np.inf)
@@ -82,8 +83,8 @@ def isolated(row: np.ndarray, residual: Array, variance: Array) -> np.ndarray:
         z = np.where(same, z, np.inf)
         nearest[lag:] = np.minimum(nearest[lag:], z)
         nearest[:-lag] = np.minimum(nearest[:-lag], z)
-    enough = np.bincount(row)[row] >= 2 * NEIGHBOURS + 1
-    return (nearest > ISOLATED_SIGMAS) & enough
+    count = np.bincount(row)[row]
+    return (nearest > ISOLATED_SIGMAS * (1.0 + (FEW_POINTS / count) ** 2)) & (count > 2 * NEIGHBOURS + 1)
 
 
 def strongest_step(

@@ -1,65 +1,116 @@
-"""Which unit of a fleet is unlike its siblings: Rosner's many-outlier procedure with each value's own uncertainty."""
+"""What the siblings of a unit tell: whether it is unlike them, and how large its scatter can be believed to be."""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from fieldcal.rotation import Array
 
 ENOUGH_SIBLINGS = 5
 MOST_OUTLIERS = 0.25
 """Largest share of a group that is looked at as outliers."""
+REFERENCE_LEVEL = 0.05
+"""A value that is an outlier at this level does not serve as a sibling to others."""
+LEAST_FREEDOM = 0.5
 
 
-def sibling_distance(group: np.ndarray, value: Array, sd: Array, n_groups: int) -> tuple[Array, Array]:
+def sibling_distance(group: np.ndarray, value: Array, sd: Array) -> tuple[Array, Array]:
     """(distance from the siblings in sd, its p-value), each (n,).
 
-    The values of a group scatter about a common mean as siblings do, of unknown variance, plus each value's own sd².
-    The most distant one is taken out, then the next, up to a quarter of the group; each is measured against those still
-    in, t = (x − mean)/√(s²(1 + 1/k) + sd²), with k − 1 degrees of freedom, and its p-value counts the k + 1 that it was
-    the most distant of (generalised extreme studentised deviate). Those never taken out are measured against the
-    others. NaN and p = 1 in groups with fewer than six.
+    The values of a group scatter about a common mean as siblings do, of unknown variance, plus each value's own sd². A
+    value is measured against the others of its group that are no outliers (`outliers`), t = (x − mean)/√(s²(1 + 1/k) +
+    sd²) with k − 1 degrees of freedom. The p-value is that of one comparison: many are made, which is the caller's to
+    count. NaN and p = 1 in groups with fewer than six.
+    """
+    z, p = np.full(len(value), np.nan), np.ones(len(value))
+    for members in _groups(group):
+        if len(members) > ENOUGH_SIBLINGS:
+            out = outliers(value[members], sd[members], REFERENCE_LEVEL)
+            z[members], freedom = _distances(value[members], sd[members], ~out)
+            p[members] = 2.0 * stats.t.sf(np.abs(z[members]), freedom)
+    return z, p
+
+
+def outliers(value: Array, sd: Array, level: float) -> np.ndarray:
+    """Outliers among values (n,) with their sd: Rosner's generalised extreme studentised deviate.
+
+    The most distant value is taken out, then the next, up to a quarter of them; each has the p-value of being the most
+    distant of those still in. All up to the last significant one are outliers: they may have hidden each other.
 
     References
     ----------
     Rosner (1983), Technometrics 25, 165–172.
     """
-    z, p = np.full(len(value), np.nan), np.ones(len(value))
-    for g in range(n_groups):
-        members = np.flatnonzero(group == g)
-        if len(members) > ENOUGH_SIBLINGS:
-            z[members], p[members] = _one_group(value[members], sd[members])
-    return z, p
-
-
-def _one_group(value: Array, sd: Array) -> tuple[Array, Array]:
-    n = len(value)
-    inside = np.ones(n, dtype=bool)
-    out, p_out = [], []
-    for _ in range(int(MOST_OUTLIERS * n)):
-        t = _distances(value, sd, inside)
+    inside = np.ones(len(value), dtype=bool)
+    taken, last = [], 0
+    for _ in range(int(MOST_OUTLIERS * len(value))):
+        t, freedom = _distances(value, sd, inside)
         i = int(np.argmax(np.where(inside, np.abs(t), -1.0)))
-        k = int(inside.sum()) - 1
-        if k < ENOUGH_SIBLINGS:
+        if int(inside.sum()) - 1 < ENOUGH_SIBLINGS:
             break
-        out.append(i)
-        p_out.append(min(1.0, (k + 1) * 2.0 * float(stats.t.sf(abs(t[i]), k - 1))))
+        taken.append(i)
+        if int(inside.sum()) * 2.0 * float(stats.t.sf(abs(t[i]), freedom[i])) <= level:
+            last = len(taken)
         inside[i] = False
-    p = np.ones(n)
-    # Rosner: all up to the last significant one are outliers together, so each has the best of what followed it.
-    best = np.minimum.accumulate(np.array(p_out)[::-1])[::-1] if out else np.empty(0)
-    p[out] = best
-    significant = np.zeros(n, dtype=bool)
-    significant[[i for i, pi in zip(out, best, strict=True) if pi < 0.05]] = True
-    return _distances(value, sd, ~significant), p
+    result = np.zeros(len(value), dtype=bool)
+    result[taken[:last]] = True
+    return result
 
 
-def _distances(value: Array, sd: Array, inside: np.ndarray) -> Array:
-    """t of each value against the others that are inside."""
-    others = inside[None, :] & ~np.eye(len(value), dtype=bool)
-    k = others.sum(axis=1)
-    mean = others @ value / k
-    s2 = np.sum(others * (value[None, :] - mean[:, None]) ** 2, axis=1) / (k - 1)
+def _distances(value: Array, sd: Array, inside: np.ndarray) -> tuple[Array, Array]:
+    """t of each value against the others that are inside, and its degrees of freedom."""
+    x = value - np.median(value[inside])
+    own = inside * x
+    k = inside.sum() - inside.astype(float)
+    mean = (own.sum() - own) / k
+    s2 = np.maximum((own @ own - own**2) / k - mean**2, 0.0) * k / (k - 1.0)
     spread = np.sqrt(s2 * (1.0 + 1.0 / k) + sd**2)
-    return np.asarray((value - mean) / np.maximum(spread, 1e-300))
+    return np.asarray((x - mean) / np.maximum(spread, 1e-300)), np.asarray(k - 1.0)
+
+
+def moderated_variance(group: np.ndarray, variance: Array, freedom: Array) -> tuple[Array, Array]:
+    """(variance, freedom), each (n,), after each variance has been drawn towards its siblings'.
+
+    A variance from few degrees of freedom is itself uncertain; siblings tell what is usual. Theirs are taken as draws
+    from a scaled inverse χ² with d0 degrees of freedom about s0², both found from the mean and variance of log s²; then
+    s̃² = (d0 s0² + d s²)/(d0 + d), with d0 + d degrees of freedom. Siblings that differ much give a small d0: then each
+    keeps its own. So do groups with fewer than six, and entries that are not finite.
+
+    References
+    ----------
+    Smyth (2004), Statistical Applications in Genetics and Molecular Biology 3(1), section 6.2.
+    """
+    result, total = variance.copy(), freedom.copy()
+    usable = np.isfinite(variance) & (variance > 0.0) & (freedom > LEAST_FREEDOM)
+    for everyone in _groups(group):
+        members = everyone[usable[everyone]]
+        if len(members) <= ENOUGH_SIBLINGS:
+            continue
+        half = 0.5 * freedom[members]
+        e = np.log(variance[members]) - special.digamma(half) + np.log(half)
+        surplus = float(np.var(e, ddof=1) - np.mean(special.polygamma(1, half)))
+        d0 = _inverse_trigamma(surplus) * 2.0 if surplus > 0.0 else np.inf
+        d0 = min(d0, float(freedom[members].sum()))
+        s0 = np.exp(float(e.mean()) + special.digamma(0.5 * d0) - np.log(0.5 * d0))
+        total[members] = freedom[members] + d0
+        result[members] = (d0 * s0 + freedom[members] * variance[members]) / total[members]
+    return result, total
+
+
+def _groups(label: np.ndarray) -> list[np.ndarray]:
+    """Indices of equal labels."""
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+
+
+def _inverse_trigamma(y: float) -> float:
+    """x with ψ′(x) = y, by Newton on 1/ψ′, which is convex and nearly linear."""
+    x = 0.5 + 1.0 / y
+    for _ in range(50):
+        trigamma = float(special.polygamma(1, x))
+        step = trigamma * (1.0 - trigamma / y) / float(special.polygamma(2, x))
+        x += step
+        if abs(step) <= 1e-10 * x:
+            break
+    return x

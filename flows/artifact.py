@@ -17,10 +17,13 @@ def keep_artifact(result: Mapping[str, Any], root: Path) -> None:
     from prefect.artifacts import create_table_artifact
 
     counts = ", ".join(f"{result[verdict]} {verdict}" for verdict in VERDICTS)
-    rows = [row for log in result["logs"] for row in _rows(log)]
+    news = [
+        {"log": change["vehicle_id"], "what": change["kind"], "why": change["sentence"]} for change in result["changes"]
+    ]
+    rows = news + [row for log in result["logs"] for row in _rows(log)]
     told = (
         f"{len(result['logs'])} logs: {counts}. {result['stages_run']} stages run, {result['stages_cached']} from the "
-        f"cache. History: `{root}/tables`, reports: `{root}/reports`."
+        f"cache. History: `{root}/tables`. Report: `{result['report']}`."
     )
     if len(rows) > MOST_ROWS:
         told += f" The first {MOST_ROWS} of {len(rows)} rows; all: `fieldcal sql 'SELECT * FROM refusals'`."

@@ -27,6 +27,7 @@ app = App(
     version=fieldcal.__version__,
     result_action="return_value",
     help_format="plaintext",
+    suppress_keyboard_interrupt=False,
     default_parameter=Parameter(negative=""),
 )
 

@@ -40,7 +40,7 @@ def export(
     from flows.fly import constants_of
     from flows.show import say
     from warehouse import Warehouse
-    from warehouse.errors import disk
+    from warehouse.files import write_bytes
 
     result = FORMATS[to](constants_of(Warehouse(warehouse).root, vehicle, at_temperature))
     for warning in result.warnings:
@@ -48,8 +48,7 @@ def export(
     if output is None:
         print(result.text, end="")
     else:
-        with disk(output, "written"):
-            output.write_text(result.text, encoding="utf-8")
+        write_bytes(output, result.text.encode())
     return 0
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from fieldcal import drift, fleet
+from fieldcal.histories import ENOUGH_SESSIONS, Histories
 from flows.ask import existing
 from flows.drift_reasons import reason
 from flows.drift_warm_up import known_slopes
@@ -24,25 +25,30 @@ SIGNED = ("scale", "bias", "zero_bias")
 VPS, AGREEMENT = "vps", "fit"
 """What stands as `sensor` of rows about the VPS clock and about agreement (Theil's coefficients)."""
 DAY_US = 86_400_000_000
+ATTEMPTS = 10
 
 
 def update_drift(root: Path) -> tuple[str, ...]:
     """Publish the trends of every IMU under the vehicle that carries it now; the vehicles whose table changed.
 
-    A function of the history alone: the same history gives the same bytes, and then nothing is written.
+    A function of the history alone: the same history gives the same bytes, and then nothing is written. When another
+    process publishes flights meanwhile, it is done again, so that whoever ends last leaves the trends of all.
 
     Raises
     ------
     WarehouseError
         As `warehouse.publish.publish`.
     """
-    table = drift_table(root)
-    vehicles = set(table["vehicle_id"].to_list()) | _with_drift(root)
-    return tuple(
-        vehicle_id
-        for vehicle_id in sorted(vehicles)
-        if publish(root, vehicle_id, {"drift": table.filter(pl.col("vehicle_id") == vehicle_id)}, ())
-    )
+    changed: set[str] = set()
+    for _ in range(ATTEMPTS):
+        before = _state(root)
+        table = drift_table(root)
+        for vehicle_id in sorted(set(table["vehicle_id"].to_list()) | _with_drift(root)):
+            if publish(root, vehicle_id, {"drift": table.filter(pl.col("vehicle_id") == vehicle_id)}, ()):
+                changed.add(vehicle_id)
+        if _state(root) == before:
+            break
+    return tuple(sorted(changed))
 
 
 def drift_table(root: Path) -> pl.DataFrame:
@@ -56,7 +62,7 @@ def table_of(flights: pl.DataFrame) -> pl.DataFrame:
         return empty_frame("drift")
     rows, trends = trends_of(flights)
     group, value, sd = _siblings(rows, trends)
-    fleet_z, fleet_p = fleet.sibling_distance(group, value, sd, int(group.max()) + 1)
+    fleet_z, fleet_p = fleet.sibling_distance(group, value, sd)
     result = rows.with_columns(
         **{
             name: pl.Series(np.asarray(column, dtype=float), nan_to_null=True)
@@ -80,9 +86,7 @@ def table_of(flights: pl.DataFrame) -> pl.DataFrame:
         change_at=_moments(trends.change_day),
         status=pl.Series(drift.statuses(trends, fleet_p).tolist(), dtype=pl.String),
     )
-    told = result.with_columns(
-        reason=pl.Series([reason(row) for row in result.iter_rows(named=True)], dtype=pl.String)
-    )
+    told = result.with_columns(reason=pl.Series([reason(row) for row in result.iter_rows(named=True)], dtype=pl.String))
     return told.select(TABLES["drift"].column_names).sort(KEY)
 
 
@@ -134,7 +138,7 @@ def history_of_everything(root: Path) -> pl.DataFrame:
 def trends_of(flights: pl.DataFrame) -> tuple[pl.DataFrame, drift.Trends]:
     """(one row a series with what is the same throughout it, its trends) of `history_of_everything`'s rows."""
     numbered = flights.with_columns(row=pl.struct(KEY).rle_id())
-    kept = drift.Histories(
+    kept = Histories(
         row=numbered["row"].to_numpy().astype(np.int64),
         session=flights.select(pl.struct("vehicle_id", "session_id").rank("dense"))
         .to_series()
@@ -145,12 +149,14 @@ def trends_of(flights: pl.DataFrame) -> tuple[pl.DataFrame, drift.Trends]:
         value=flights["value"].to_numpy(),
         sd=flights["sd"].to_numpy(),
     )
-    trends = drift.analyse(kept)
     rows = numbered.group_by("row", maintain_order=True).agg(
         *(pl.col(name).last() for name in (*KEY, "vehicle_id", "unit")),
         temperature_min_degc=pl.col("temperature_degc").min(),
         temperature_max_degc=pl.col("temperature_degc").max(),
     )
+    siblings = rows.select(pl.struct("sensor", "method", "parameter", "unit").rank("dense")).to_series()
+    kept = replace(kept, kind=siblings.to_numpy())
+    trends = drift.analyse(kept)
     if (known := known_slopes(flights, kept, rows, trends)) is not None:
         trends = drift.analyse(replace(kept, slope_per_degc=known[0], slope_per_degc_sd=known[1]))
     # A flight set aside is not what the line is as of.
@@ -164,7 +170,7 @@ def _siblings(rows: pl.DataFrame, trends: drift.Trends) -> tuple[np.ndarray, np.
     A VPS clock's lag is arbitrary, its scatter from session to session is not: there the logarithm of the scatter."""
     value, sd = trends.value.copy(), trends.sd.copy()
     axis = ["imu_id", "sensor", "method", "axis"]
-    table = rows.with_columns(index=pl.int_range(pl.len()), value=pl.Series(value))
+    table = rows.with_columns(value=pl.Series(value))
     scale = table.filter(pl.col("parameter") == "scale").select(*axis, sign=pl.col("value").sign())
     sign = table.join(scale, on=axis, how="left", maintain_order="left")["sign"].fill_null(1.0).to_numpy()
     signed = rows["parameter"].is_in(SIGNED).to_numpy()
@@ -176,7 +182,7 @@ def _siblings(rows: pl.DataFrame, trends: drift.Trends) -> tuple[np.ndarray, np.
     value, sd = np.where(clock, scatter, value), np.where(clock, scatter_sd, sd)
     group = rows.select(pl.struct("sensor", "method", "parameter", "axis", "unit").rank("dense")).to_series().to_numpy()
     group = group.astype(np.int64)
-    alone = (trends.n_sessions < drift.ENOUGH_SESSIONS) | ~np.isfinite(value) | ~np.isfinite(sd)
+    alone = (trends.n_sessions < ENOUGH_SESSIONS) | ~np.isfinite(value) | ~np.isfinite(sd)
     group[alone] = group.max() + 1 + np.arange(alone.sum())
     return group, np.where(alone, 0.0, value), np.where(alone, 1.0, sd)
 
@@ -185,6 +191,12 @@ def _moments(day: np.ndarray) -> pl.Series:
     """Days since 1970 as moments, to the microsecond; NaN becomes null."""
     exact = [None if np.isnan(d) else round(float(d) * DAY_US) for d in day]
     return pl.Series(exact, dtype=pl.Int64).cast(pl.Datetime("us", "UTC"))
+
+
+def _state(root: Path) -> list[tuple[str, int, int, int]]:
+    """What the files of the history are; they are replaced whole, so another content is another file."""
+    files = [path for table in ("calibration", "flight", "sync", "fit") for path in history_files(root, table)]
+    return [(str(path), (s := path.stat()).st_ino, s.st_size, s.st_mtime_ns) for path in files]
 
 
 def _with_drift(root: Path) -> set[str]:

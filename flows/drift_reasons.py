@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from fieldcal.drift import ENOUGH_SESSIONS
+from fieldcal.histories import ENOUGH_SESSIONS
 from flows.show import number, with_sd
 
 UNCONFIRMED_SIGMAS = 5.0

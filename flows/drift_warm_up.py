@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from fieldcal.drift import Histories, Trends, pooled
+from fieldcal.drift import Trends, pooled
+from fieldcal.histories import Histories
 from fieldcal.rotation import Array
 from fieldcal.stages.warm_up import METHOD, PARAMETER
 

@@ -45,7 +45,7 @@ def constants_of(root: Path, vehicle_id: str, temperature_degc: float | None = N
     if not triads:
         raise FieldcalError(
             "no_calibration",
-            f"No sensor of {vehicle_id!r} has all its axes calibrated; `fieldcal sql \"FROM refusals\"` says why.",
+            f'No sensor of {vehicle_id!r} has all its axes calibrated; `fieldcal sql "FROM refusals"` says why.',
         )
     as_of = "" if last["started_at"] is None else last["started_at"].isoformat()
     return Constants(vehicle_id, str(last["imu_id"]), triads, as_of)

@@ -45,4 +45,4 @@ def write_ledger(root: Path, jobs: Iterable[Job]) -> None:
 
 
 def _place(root: Path) -> Path:
-    return root / "stages" / "ledger.json"
+    return root / "night" / "logs.json"

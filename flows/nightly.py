@@ -25,6 +25,7 @@ from prefect.states import Completed
 from fieldcal.configuration import Configuration
 from flows.alive import alive
 from flows.artifact import keep_artifact
+from flows.closing import close_night, tell_prefect
 from flows.flights import flights, lost, one_step
 from flows.history import publish_vehicle, withdraw
 from flows.jobs import Source, configuration_of, find_source
@@ -161,8 +162,11 @@ def _night(root_of_logs: Path, root: Path, config: str | None, only: Path | None
         tell_plan(len(plan.jobs), len(plan.missing))
         outcomes = [*_from_cache(plan), *_calibrate(root, plan, source, parallel)]
         _publish(root, settings, outcomes)
-        result = summary(outcomes, plan.copies, plan.copied, root)
+        closing = close_night(root)
+        told = [change.row() for change in closing.changes]
+        result = {**summary(outcomes, plan.copies, plan.copied, root), "changes": told, "report": str(closing.report)}
         keep_artifact(result, root)
+        tell_prefect(closing.changes)
         return result
 
 

@@ -67,4 +67,4 @@ def _taken(root: Path, name: str, state: str | None) -> dict[str, Any] | Excepti
 
 
 def _place(root: Path, name: str) -> Path:
-    return root / "stages" / "handed-over" / f"{name}.json"
+    return root / "night" / "handed-over" / f"{name}.json"

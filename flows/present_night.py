@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 WORST = 5
 REFUSALS = 12
+CHANGES = 20
 
 
 class NightProgress:
@@ -85,7 +86,13 @@ def print_night(console: Console, result: Mapping[str, Any], root: Path) -> None
     if worst:
         columns = ["log", "quantity", "method", "against", "TIC", "rms"]
         console.print(table(columns, worst, "Poorest agreement (Theil inequality coefficient, smoothed)"))
-    console.print(f"History: {root}/tables (fieldcal history, fieldcal sql)", markup=False)
+    if result["changes"]:
+        lines = [[change["kind"], change["sentence"]] for change in result["changes"]]
+        console.print(table(["new", "what"], lines[:CHANGES], "What changed in the fleet"))
+        if len(lines) > CHANGES:
+            console.print(f"  … and {len(lines) - CHANGES} more: fieldcal drift", markup=False)
+    console.print(f"History: {root}/tables (fieldcal history, drift, sql)", markup=False)
+    console.print(f"Report:  {result['report']} (fieldcal report --vehicle V, --flight ID)", markup=False)
 
 
 def _refusals(log: Mapping[str, Any]) -> list[list[str]]:

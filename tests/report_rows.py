@@ -156,7 +156,7 @@ def _history(
     value = truth + sigma * rng.standard_normal(n)
     row: dict[str, Any] = {"n_flights": n, "status": fault}
     if fault == "insufficient" or n < 5:
-        return value, {**row, "status": "insufficient"}
+        return value, {**row, "status": "insufficient", "reason": f"{n} sessions: a trend needs 5."}
     used = np.arange(n) >= (step_at or 0)
     x = np.column_stack([np.ones(n), degc - REFERENCE_DEGC, day - day[-1]])[used]
     estimate = np.linalg.lstsq(x, value[used], rcond=None)[0]

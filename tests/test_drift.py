@@ -10,8 +10,9 @@ from drift_support import PER_DEGC, SD, TAU, VALUE, fleet
 from numerics_support import ROUNDING
 from scipy import optimize
 
-from fieldcal.drift import ENOUGH_SESSIONS, FALSE_ALARMS, Histories, analyse, statuses
-from fieldcal.fleet import sibling_distance
+from fieldcal.drift import FALSE_ALARMS, analyse, statuses
+from fieldcal.fleet import moderated_variance, outliers, sibling_distance
+from fieldcal.histories import ENOUGH_SESSIONS, Histories
 from fieldcal.random_effects import Grouping, fit_random_effects
 
 HONEST = (0.8, 1.25)
@@ -251,8 +252,16 @@ ROSNER = (
 def test_siblings_reproduce_rosners_example() -> None:
     """54 values of Rosner (1983), as in the NIST handbook: three outliers at 5 %, though the first alone is none."""
     value = np.array([float(v) for v in ROSNER.split()])
-    _, p = sibling_distance(np.zeros(54, dtype=int), value, np.zeros(54), 1)
-    assert value[p <= 0.05].tolist() == [5.34, 5.42, 6.01]
+    assert value[outliers(value, np.zeros(54), 0.05)].tolist() == [5.34, 5.42, 6.01]
+
+
+def test_p_values_of_siblings_are_uniform() -> None:
+    rng = np.random.default_rng(21)
+    n, group = 12, np.repeat(np.arange(400), 12)
+    sd = 0.3 * np.ones(400 * n)
+    _, p = sibling_distance(group, np.hypot(1.0, sd) * rng.normal(size=400 * n), sd)
+    for level in (0.05, 0.5):
+        assert np.mean(p < level) == pytest.approx(level, rel=0.25)
 
 
 def test_an_odd_sibling_is_named_and_few_siblings_are_not_judged() -> None:
@@ -260,13 +269,55 @@ def test_an_odd_sibling_is_named_and_few_siblings_are_not_judged() -> None:
     value = rng.normal(size=60)
     value[12] += 25.0
     group = np.repeat(np.arange(5), 12)
-    z, p = sibling_distance(group, value, np.full(60, 0.1), 5)
-    assert np.flatnonzero(p < 1e-3).tolist() == [12]
+    z, p = sibling_distance(group, value, np.full(60, 0.1))
+    assert np.flatnonzero(p < 1e-5).tolist() == [12]
     assert z[12] > 10.0
     # The same distance with an uncertainty as large says nothing.
     uncertain = np.full(60, 0.1)
     uncertain[12] = 25.0
-    assert sibling_distance(group, value, uncertain, 5)[1].min() > 1e-3
-    z, p = sibling_distance(np.zeros(5, dtype=int), value[:5], np.ones(5), 1)
+    assert sibling_distance(group, value, uncertain)[1][12] > 0.1
+    z, p = sibling_distance(np.zeros(5, dtype=int), value[:5], np.ones(5))
     assert np.isnan(z).all()
     assert (p == 1.0).all()
+
+
+def test_siblings_lend_their_scatter() -> None:
+    """With five sessions there are two degrees of freedom and a unit's own sd is next to worthless; its siblings' say
+    what is usual. Units whose scatter is really their own keep it."""
+    f = fleet(18, 120, sessions=5, sd=0.1)
+    kind = np.repeat(np.arange(10), 12)
+    alone = analyse(f.histories())
+    among = analyse(f.histories(kind=kind))
+    whole = alone.n_sessions == 5
+    assert whole.mean() > 0.97
+    assert rms(((alone.slope_per_degc - PER_DEGC) / alone.slope_per_degc_sd)[whole]) > 1.5
+    assert HONEST[0] < rms(((among.slope_per_degc - PER_DEGC) / among.slope_per_degc_sd)[whole]) < HONEST[1]
+    assert HONEST[0] < rms((among.value - VALUE) / among.sd) < HONEST[1]
+    own = np.geomspace(0.1, 10.0, 12)
+    f = fleet(19, 12, sessions=60, tau=0.0, sd=0.0)
+    scattered = f.value + own[:, None] * np.random.default_rng(19).normal(size=f.value.shape)
+    kept = analyse(replace(f, value=scattered).histories(kind=np.zeros(12, dtype=int)))
+    assert kept.session_sd == pytest.approx(own, rel=0.3)
+
+
+def test_moderated_variance_is_smyths() -> None:
+    """Variances drawn from the model that it assumes: its d0 and s0² come back, and so does their posterior mean."""
+    rng = np.random.default_rng(20)
+    d, d0, s0 = 4.0, 10.0, 3.0
+    true = d0 * s0 / rng.chisquare(d0, 4000)
+    found = true * rng.chisquare(d, 4000) / d
+    moderated, freedom = moderated_variance(np.zeros(4000, dtype=int), found, np.full(4000, d))
+    assert freedom - d == pytest.approx(d0, rel=0.15)
+    assert moderated == pytest.approx((d0 * s0 + d * found) / (d0 + d), rel=0.1)
+    assert np.mean((np.log(moderated) - np.log(true)) ** 2) < 0.5 * np.mean((np.log(found) - np.log(true)) ** 2)
+    few, _ = moderated_variance(np.zeros(5, dtype=int), found[:5], np.full(5, d))
+    assert few.tolist() == found[:5].tolist()
+
+
+def test_without_times_there_is_no_order_to_find_a_step_in() -> None:
+    f = fleet(22, 20)
+    stepped = f.value + STEP * (f.session >= 12)
+    trends = analyse(replace(f, value=stepped).histories(time_day=np.full(f.value.size, np.nan)))
+    assert np.isnan(trends.change_size).all()
+    assert np.isnan(trends.last_z).all()
+    assert np.isfinite(trends.value).all()

@@ -11,6 +11,7 @@ import pytest
 from drift_history import PER_DEGC, SESSIONS, TAU, UNIT_SPREAD, publish_fleet
 from history_rows import START, lead, rows
 
+import flows.drift
 from flows.cli import run
 from flows.drift import drift_table, history_of_everything, update_drift
 from warehouse import Warehouse
@@ -234,3 +235,24 @@ def test_warm_up_flights_sharpen_the_slope_unless_they_contradict(tmp_path: Path
     assert found["x"]["sd"] < alone["x"]["sd"] * 1.01
     for axis in "yz":
         assert found[axis]["slope_per_degc"] == pytest.approx(alone[axis]["slope_per_degc"], rel=1e-9)
+
+
+def test_flights_published_meanwhile_are_in_the_trends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process publishes a vehicle between reading and writing: the trends written last are of both."""
+    other = tmp_path / "other"
+    publish_fleet(other, units=2, sessions=8)
+    update_drift(other)
+    published = publish_fleet(tmp_path / "root", units=1, sessions=8)
+    late = Warehouse(other).scan("calibration", vehicle_id="v01").collect()
+    assert published["v00"].height == late.height
+    read = flows.drift.history_of_everything
+
+    def and_then_another(root: Path) -> pl.DataFrame:
+        rows_read = read(root)
+        publish(root, "v01", {"calibration": late}, late["flight_id"].unique().to_list())
+        return rows_read
+
+    monkeypatch.setattr(flows.drift, "history_of_everything", and_then_another)
+    update_drift(tmp_path / "root")
+    tables = [Warehouse(root).scan("drift").collect() for root in (tmp_path / "root", other)]
+    assert tables[0].equals(tables[1])

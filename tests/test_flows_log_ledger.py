@@ -66,7 +66,7 @@ def test_a_damaged_ledger_is_no_ledger(archive: Path, tmp_path: Path, monkeypatc
     root = tmp_path / "warehouse"
     write_ledger(root, hashed(archive, root, monkeypatch)[0])
     assert len(read_ledger(root)) == 2
-    place = root / "stages" / "ledger.json"
+    place = root / "night" / "logs.json"
     data = place.read_bytes()
     place.write_bytes(data.replace(b"a.mcap", b"c.mcap"))
     assert read_ledger(root) == {}

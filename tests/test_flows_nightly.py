@@ -302,4 +302,5 @@ def test_an_interrupt_ends_the_night_in_two_seconds(
     _, talk = process.communicate(timeout=10)
     assert time.monotonic() - began < 2.5
     assert process.returncode == 130
+    assert b"Interrupted; what is done is kept" in talk
     assert b"Traceback" not in talk

@@ -202,8 +202,9 @@ def test_a_root_that_cannot_be_written_ends_the_night_with_a_sentence(
     own, root, first = grown
     folders = [root, *(path for path in root.rglob("*") if path.is_dir())]
     for path in root.parents:
-        if Path(tempfile.gettempdir()) in path.parents and path.stat().st_uid == os.geteuid():
-            path.chmod(path.stat().st_mode | 0o055)
+        if path == Path(tempfile.gettempdir()):
+            break
+        path.chmod(path.stat().st_mode | 0o055)
     for folder in folders:
         folder.chmod(0o555)
     try:

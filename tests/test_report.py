@@ -31,7 +31,7 @@ from flows.report import (
     write_night_reports,
     write_vehicle_report,
 )
-from flows.report.plot import thinned, with_gaps, without_wraps
+from flows.report.plot import INK, thinned, with_gaps, without_wraps
 from flows.report.trend import predicted
 from flows.rows import flight_row, published_tables, rows_frame, run_rows
 from flows.rows import lead as lead_of
@@ -93,6 +93,7 @@ def sound(path: Path) -> Page:
         for name in ("aria-labelledby", "clip-path"):
             for target in re.findall(r"#?([\w-]+)\)?", (attributes.get(name) or "").replace("url(", "")):
                 assert target in ids, target
+    assert not [colour for colour in INK.values() if colour in path.read_text(encoding="utf-8")]
     assert "://" not in re.sub(r'xmlns="http://www.w3.org/2000/svg"', "", path.read_text(encoding="utf-8"))
     assert [a.get("role") for a in page.named("svg")] == ["img"] * len(page.named("svg"))
     return page
@@ -125,6 +126,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
             f"{stage}.{name}": (StageStore(root).load(stage, job.flight_id, key, [name])[name], key)
             for stage, name in (source.split(".") for sources in PUBLISHED.values() for source in sources)
             for key in (work.records[stage]["run_key"],)
+            if name in work.records[stage]["outputs"]
         }
         history = published_tables(leading, tables)
         history["flight"] = rows_frame("flight", [flight_row(job, leading, facts)])
@@ -165,14 +167,18 @@ def test_vehicle_marks_its_step_and_says_what_to_fly_with(fleet: Path) -> None:
     page = sound(path)
     assert "2026-08-03 12:00" in page.text  # the flight after the step
     assert "Dashed vertical line: detected step" in page.text
-    assert page.text.count("History as of 2026-10-12 12:00.") >= 3 * 4  # sensors and parameters
+    assert page.text.count("Trend of 24 flights") >= 3 * 4  # sensors and parameters
+    assert "Trend of 24 flights, after the step of 2026-08-03." in page.text
     assert "every status is insufficient" not in page.text
     assert len(page.named("svg")) == 3 * 4 + 2
 
 
 def test_vehicle_with_too_few_flights_says_so(fleet: Path) -> None:
     page = sound(write_vehicle_report(fleet, "insufficient-1"))
-    assert "Too few flights for a trend (2 usable flights): every status is insufficient." in page.text
+    assert (
+        "Too few flights for a trend (2 usable flights): every status is insufficient. 2 sessions: a trend needs 5."
+        in page.text
+    )
 
 
 def test_vehicle_shows_refused_values_and_why(fleet: Path) -> None:
@@ -343,7 +349,7 @@ def test_a_wrapped_angle_is_broken_not_drawn_across() -> None:
 
 
 def test_band_is_the_regressions_own_standard_deviation() -> None:
-    row = {"value_at_25degc": 2.0, "sd": 0.3, "slope_per_degc": 0.1, "slope_per_degc_sd": 0.02}
+    row = {"value_at_25degc": 2.0, "sd": 0.3, "slope_per_degc": 0.1, "slope_per_degc_sd": 0.02, "best_known_degc": None}
     row |= {"slope_per_day": -0.5, "slope_per_day_sd": 0.4}
     value, sd = predicted(row, 35.0, -1.0)
     assert value == pytest.approx(2.0 + 1.0 + 0.5)

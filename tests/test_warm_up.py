@@ -82,7 +82,8 @@ def test_a_simulated_flight_tells_its_slope() -> None:
     errors = []
     for seed in range(12):
         experiment = Experiment(
-            seed=seed, duration_s=90.0, temperature_degc=(10.0, 30.0), bias_per_degc={"gyroscope": PER_DEGC}, vps=False
+            seed=seed, duration_s=90.0, temperature_degc=(10.0, 30.0), bias_per_degc={"gyroscope": PER_DEGC}, vps=False,
+            band_limit=False,
         )
         result = find_warm_up(signals(simulate(experiment)), settings(experiment))
         rows = result.tables["calibration"]

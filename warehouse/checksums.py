@@ -6,13 +6,14 @@ nothing), so that after a crash at that moment either is what it should be; afte
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import hashlib
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from warehouse.errors import disk
 from warehouse.files import file_sha256, write_bytes
-from warehouse.layout import checksum_path
+from warehouse.layout import checksum_path, history_files
 from warehouse.sealed import BrokenSeal, seal, unseal
 
 
@@ -60,3 +61,14 @@ def problem(root: Path, path: Path, sha256: str | None) -> str | None:
     if sha256 in allowed:
         return None
     return "it is missing" if sha256 is None else "its content is not what was written: the sha256 differs"
+
+
+def history_digest(root: Path, tables: Iterable[str]) -> str:
+    """One digest of what these history tables hold by their records: the same as long as nothing was published."""
+    digest = hashlib.sha256()
+    for table in sorted(tables):
+        for path in history_files(root, table):
+            beside = checksum_path(root, path)
+            recorded_now = beside.read_bytes() if beside.exists() else b"none"
+            digest.update(f"{path.relative_to(root)}\0".encode("utf-8", "surrogateescape") + recorded_now)
+    return digest.hexdigest()

@@ -1,4 +1,4 @@
-"""One writer a vehicle: a lock of the operating system, which ends with the process that holds it."""
+"""One writer a vehicle, and one for the fleet: locks of the operating system, which end with their process."""
 
 from __future__ import annotations
 
@@ -24,26 +24,32 @@ def vehicle_lock(root: Path, vehicle_id: str, timeout_s: float = 300.0) -> Itera
     WarehouseError
         `busy`: another process held it for `timeout_s`.
     """
+    with _lock(root, lock_path(root, vehicle_id), f"publishing vehicle {vehicle_id!r}", timeout_s):
+        yield
+
+
+@contextmanager
+def fleet_lock(root: Path, timeout_s: float = 3600.0) -> Iterator[None]:
+    """Hold the lock of what concerns the whole fleet, its trends, during the block; raises as `vehicle_lock`."""
+    with _lock(root, root / ".fleet-lock", "working on the fleet's trends", timeout_s):
+        yield
+
+
+@contextmanager
+def _lock(root: Path, path: Path, doing: str, timeout_s: float) -> Iterator[None]:
     prepare(root)
-    path = lock_path(root, vehicle_id)
     with disk(path, "opened"):
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
-        _acquire(descriptor, path, vehicle_id, timeout_s)
+        give_up = time.monotonic() + timeout_s
+        while not _locked(descriptor, path):
+            if time.monotonic() >= give_up:
+                what = f"another process has been {doing} for {timeout_s:g} s ({path}); try later."
+                raise WarehouseError("busy", what)
+            time.sleep(_RETRY_S)
         yield
     finally:
         os.close(descriptor)
-
-
-def _acquire(descriptor: int, path: Path, vehicle_id: str, timeout_s: float) -> None:
-    give_up = time.monotonic() + timeout_s
-    while not _locked(descriptor, path):
-        if time.monotonic() >= give_up:
-            raise WarehouseError(
-                "busy",
-                f"another process has been publishing vehicle {vehicle_id!r} for {timeout_s:g} s ({path}); try later.",
-            )
-        time.sleep(_RETRY_S)
 
 
 def _locked(descriptor: int, path: Path) -> bool:

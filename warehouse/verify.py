@@ -21,7 +21,9 @@ Problem = tuple[str, str | None]
 
 
 def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path], str] | None = None) -> dict[str, Any]:
-    """Check `tables/`, `signals/`, complete stage outputs and, with `archive`, the logs. Nothing is changed.
+    """Check `tables/`, `signals/`, complete stage outputs, what nights remember and, with `archive`, the logs.
+
+    Nothing is changed.
 
     Parameters
     ----------
@@ -45,7 +47,7 @@ def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path],
         raise WarehouseError(
             "no_warehouse", f"There is no warehouse at {root}; run `fieldcal nightly` or give --warehouse."
         )
-    found = [*_recorded_files(root), *_stage_files(root)]
+    found = [*_recorded_files(root), *_stage_files(root), *_night_files(root)]
     if archive is not None:
         if log_sha256 is None:
             raise ValueError("log_sha256 is needed to check an archive")
@@ -90,6 +92,17 @@ def _stage_files(root: Path) -> Iterator[Problem]:
         for output in record["outputs"].values():
             file = path.parent / str(output["file"])
             yield str(file.relative_to(root)), broken.get(file)
+
+
+def _night_files(root: Path) -> Iterator[Problem]:
+    """What the last night remembers for the next, each file with its own digest."""
+    for path in sorted((root / "night").rglob("*.json")):
+        try:
+            with disk(path, "read"):
+                unseal(path.read_bytes())
+            yield str(path.relative_to(root)), None
+        except (BrokenSeal, WarehouseError) as error:
+            yield str(path.relative_to(root)), f"what the night remembers is damaged: {error}; it may be deleted"
 
 
 def _logs(root: Path, archive: Path, log_sha256: Callable[[Path], str]) -> Iterator[Problem]:

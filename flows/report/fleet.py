@@ -11,17 +11,16 @@ import polars as pl
 
 from flows.ask import existing
 from flows.report.history import as_of_sentence, newest, usable_flights
+from flows.report.key_parameter import key_parameters
 from flows.report.links import Links, flight_name, vehicle_name
 from flows.report.page import Column, Notice, Page, Part, Section, Table, Text, badge
-from flows.report.plot import sparkline
 from flows.report.trend import STATUSES, change_sentence, worst_status
-from flows.report.words import PARAMETERS, age, count, day, plain_name, preferred, scientific, unit, with_unit
+from flows.report.words import age, day, plain_name, with_unit
 from flows.show import number
 from warehouse import Warehouse
 
 LOOKS = 200
 NOT_ANALYSED = "not analysed"
-POINTS = 60
 
 _COLUMNS = (
     Column("vehicle"),
@@ -47,8 +46,8 @@ def fleet_page(root: Path, links: Links, as_of: datetime | None) -> Page:
     vehicles = sorted(flights["vehicle_id"].unique().to_list())
     last = {row["vehicle_id"]: row for row in usable.iter_rows(named=True)}
     worst = _worst_tics(warehouse, last)
-    sparks = _sparks(warehouse, drift)
-    trends = {key[0]: part for key, part in drift.partition_by("imu_id", as_dict=True).items()}
+    trends = {str(key[0]): part for key, part in drift.partition_by("imu_id", as_dict=True).items()}
+    sparks = key_parameters(warehouse, trends)
     rows, statuses = [], dict.fromkeys((*STATUSES, NOT_ANALYSED), 0)
     for key, part in (
         flights.sort("vehicle_id", "started_at", "flight_id").partition_by("vehicle_id", as_dict=True).items()
@@ -72,7 +71,11 @@ def fleet_page(root: Path, links: Links, as_of: datetime | None) -> Page:
         *((f"vehicles: {status}", str(n)) for status, n in statuses.items() if n),
     ]
     overview: list[Part] = [
-        Table("A row per vehicle. Status is the worst of its IMU's parameters in the table drift.", _COLUMNS, rows),
+        Table(
+            "A row per vehicle (fieldcal report --vehicle V writes its page). Status: the worst of its IMU's trends.",
+            _COLUMNS,
+            rows,
+        ),
         Text(
             "A flight is usable when at least one constant came out of it. Worst TIC: the greatest Theil inequality"
             " coefficient of the last usable flight's comparisons (smoothed readings), with its rms error. Key"
@@ -133,78 +136,6 @@ def _worst_tics(warehouse: Warehouse, last: Mapping[str, Mapping[str, Any]]) -> 
     return {row["vehicle_id"]: row for row in rows.iter_rows(named=True)}
 
 
-def _sparks(warehouse: Warehouse, drift: pl.DataFrame) -> dict[str, tuple[str, str]]:
-    """For each vehicle its key parameter in words, and drawn."""
-    rows = (
-        warehouse.scan("calibration")
-        .filter((pl.col("status") == "ok") & pl.col("value").is_not_null())
-        .select(
-            "vehicle_id", "imu_id", "sensor", "method", "parameter", "axis", "value", "unit", "started_at", "flight_id"
-        )
-        .sort("started_at", "flight_id", nulls_last=False)
-        .collect()
-    )
-    key = ["sensor", "method", "parameter", "axis"]
-    told: dict[str, tuple[str, str]] = {}
-    for (vehicle,), own in rows.partition_by("vehicle_id", as_dict=True).items():
-        place = _key_parameter(drift.filter(pl.col("vehicle_id") == vehicle), own)
-        part = own.filter(*(pl.col(name) == value for name, value in zip(key, place, strict=True)))
-        shown = part.tail(POINTS)
-        values = shown["value"].to_list()
-        if not values:
-            continue
-        changed = drift.filter(
-            pl.col("vehicle_id") == vehicle, *(pl.col(n) == v for n, v in zip(key, place, strict=True))
-        )
-        step = changed["change_at"][0] if changed.height else None
-        after = [i for i, at in enumerate(shown["started_at"]) if step is not None and at is not None and at >= step]
-        name = f"{place[0]} {place[2]} {place[3]}"
-        own_unit = unit(shown["unit"][-1])
-        span = f"{number(values[0])} to {number(values[-1])} {own_unit}".strip()
-        label = f"{name} over {count(len(values), 'flight')}: {span}"
-        told[str(vehicle)] = (
-            f"{name}: {with_unit(scientific(values[-1]), shown['unit'][-1])}",
-            sparkline(values, after[0] if after and after[0] else None, label),
-        )
-    return told
-
-
-def _key_parameter(drift: pl.DataFrame, own: pl.DataFrame) -> tuple[str, str, str, str]:
-    """Sensor, method, parameter and axis: the least steady one of the drift table that the history has, else the
-    gyroscope's."""
-    there = set(own.select("sensor", "method", "parameter", "axis").iter_rows())
-    order = {status: i for i, status in enumerate(STATUSES)}
-    ranked = sorted(
-        (
-            order.get(row["status"], len(order)),
-            _place(row["parameter"]),
-            -abs(row["last_z"] or 0.0),
-            row["sensor"],
-            row["method"],
-            row["parameter"],
-            row["axis"],
-        )
-        for row in drift.iter_rows(named=True)
-        if row["status"] not in ("stable", "insufficient")
-        and (row["sensor"], row["method"], row["parameter"], row["axis"]) in there
-    )
-    if ranked:
-        return ranked[0][3:]
-    sensor = next(
-        name
-        for name in ("gyroscope", "accelerometer", "magnetometer", *sorted({p[0] for p in there}))
-        if any(p[0] == name for p in there)
-    )
-    method = preferred({p[1] for p in there if p[0] == sensor})
-    parameters = {p[2] for p in there if p[:2] == (sensor, method)}
-    parameter = next(name for name in ("zero_bias", "bias", "scale", *sorted(parameters)) if name in parameters)
-    return sensor, method, parameter, min(p[3] for p in there if p[:3] == (sensor, method, parameter))
-
-
-def _place(parameter: str) -> int:
-    return PARAMETERS.index(parameter) if parameter in PARAMETERS else len(PARAMETERS)
-
-
 def _siblings(drift: pl.DataFrame, row: Mapping[str, Any]) -> list[float]:
     """Values at 25 °C of the same parameter of the fleet's other IMUs."""
     same = (pl.col(name) == row[name] for name in ("sensor", "method", "parameter", "axis", "unit"))
@@ -257,7 +188,7 @@ def _looks(drift: pl.DataFrame, links: Links) -> list[Part]:
                 row["imu_id"],
                 f"{plain_name(row['sensor'])} {row['parameter']} {row['axis']} ({plain_name(row['method'])})",
                 badge(row["status"]),
-                change_sentence(row, _siblings(drift, row)),
+                change_sentence(row, _siblings(drift, row) if row["status"] == "outlier" else []),
                 number(row["last_z"], 2),
             ]
             for row in found[:LOOKS]

@@ -7,6 +7,7 @@ from typing import Any
 
 import polars as pl
 
+from fieldcal.stages.warm_up import METHOD as WARM_UP
 from flows.present_flight import QUANTITIES, is_consequence, sync_sentence
 from flows.report import flight_figures as draw
 from flows.report.flight_curves import Curves, curves
@@ -107,17 +108,20 @@ def _constants(calibration: pl.DataFrame) -> list[Part]:
     ]
     rows = [dict(row) for row in calibration.iter_rows(named=True)]
     for sensor, name, letter in PAPER_TABLES:
-        own = [row for row in rows if row["sensor"] == sensor]
-        if not own:
-            parts.append(Text(f"{name}: there are no constants of the {sensor}."))
-            continue
+        own = [row for row in rows if row["sensor"] == sensor and row["method"] != WARM_UP]
         printed = [row for row in own if row["parameter"] in PRINTED]
-        parts.append(_paper_table(printed, f"{name}. {sensor.capitalize()} calibration", letter))
+        if printed:
+            parts.append(_paper_table(printed, f"{name}. {sensor.capitalize()} calibration", letter))
+        else:
+            parts.append(Text(f"{name}: there are no constants of the {sensor}."))
         others = [row for row in own if row["parameter"] not in PRINTED]
         if others:
             names = " and ".join(dict.fromkeys(row["parameter"] for row in others))
             folded = _paper_table(others, f"{sensor.capitalize()}: the same as {names}", letter)
             parts.append(Folded(f"{sensor.capitalize()}: {names}", [folded]))
+    warm = [row for row in rows if row["method"] == WARM_UP]
+    if warm:
+        parts.append(_paper_table(warm, "Warm-up of the gyroscope at rest: its zero against temperature", "ω"))
     return parts
 
 

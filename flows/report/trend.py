@@ -29,7 +29,7 @@ def worst_status(drift: pl.DataFrame | None) -> str | None:
 
 def change_sentence(row: Mapping[str, Any], siblings: Sequence[float]) -> str:
     """What is not steady about a drift row: its own sentence, and what the siblings show of an outlier."""
-    told = str(row.get("reason") or "")
+    told = str(row["reason"] or "")
     if row["status"] == "outlier" and siblings:
         median = with_unit(scientific(float(np.median(siblings))), row["unit"])
         told = f"{told} Median of {count(len(siblings), 'sibling')} at 25 °C: {median}.".strip()
@@ -41,12 +41,6 @@ def change_sentence(row: Mapping[str, Any], siblings: Sequence[float]) -> str:
     return "–" if slope == "–" else f"{with_unit(slope, row['unit'])} per day."
 
 
-def reference_moment(row: Mapping[str, Any]) -> datetime | None:
-    """The moment that a drift row's value is as of; None where the row does not say."""
-    moment: datetime | None = row.get("as_of")
-    return moment
-
-
 def predicted(row: Mapping[str, Any], degc: Array | float, days: Array | float) -> tuple[Array, Array]:
     """Value and standard deviation of a drift row's regression at a temperature, so many days after its moment.
 
@@ -56,8 +50,7 @@ def predicted(row: Mapping[str, Any], degc: Array | float, days: Array | float) 
     """
     degc, later = np.asarray(degc, dtype=float), np.asarray(days, dtype=float)
     slope, slope_sd = row["slope_per_degc"] or 0.0, row["slope_per_degc_sd"] or 0.0
-    best = row.get("best_known_degc")
-    best = REFERENCE_DEGC if best is None else best
+    best = REFERENCE_DEGC if row["best_known_degc"] is None else row["best_known_degc"]
     value = row["value_at_25degc"] + slope * (degc - REFERENCE_DEGC) + (row["slope_per_day"] or 0.0) * later
     at_temperature = (row["sd"] or 0.0) ** 2 + slope_sd**2 * ((degc - best) ** 2 - (REFERENCE_DEGC - best) ** 2)
     variance = np.maximum(at_temperature, 0.0) + ((row["slope_per_day_sd"] or 0.0) * later) ** 2
@@ -70,8 +63,8 @@ def days_after(moments: list[datetime | None], reference: datetime) -> Array:
 
 
 def fly_with_sentence(row: Mapping[str, Any]) -> str:
-    """Where a constant to fly with comes from."""
-    if row["source"] == "flight":
-        at = row["temperature_degc"]
-        return f"Flight of {day(row['started_at'])}" + ("." if at is None else f", {at:.0f} °C.")
-    return f"History as of {day(row['started_at'])}." if row["source"] == "drift" else f"{row['source']}."
+    """Where a constant to fly with comes from: a row of `latest_calibration`."""
+    if row["source"] != "flight":
+        return str(row["why"])
+    at = "" if row["temperature_degc"] is None else f", {row['temperature_degc']:.0f} °C"
+    return f"Flight of {day(row['started_at'])}{at}. {row['why']}"

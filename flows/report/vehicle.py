@@ -10,6 +10,8 @@ from typing import Any
 import polars as pl
 
 from fieldcal.errors import FieldcalError
+from fieldcal.stages.warm_up import METHOD as WARM_UP
+from fieldcal.stages.warm_up import PARAMETER as WARM_UP_SLOPE
 from flows.ask import existing
 from flows.report.history import as_of_sentence, newest, reason_of, unfold, usable_flights
 from flows.report.links import Links, flight_name
@@ -21,7 +23,7 @@ from flows.show import number
 from warehouse import Warehouse
 
 FLIGHTS, REFUSALS, FEWEST_POINTS = 200, 100, 30
-OPEN = ("scale", "zero_bias")
+OPEN = ("scale", "zero_bias", WARM_UP_SLOPE)
 """Parameters whose plots are open; the others say the same in other words."""
 
 
@@ -108,14 +110,10 @@ def _sources(by_axis: Mapping[str, Mapping[str, Any]]) -> str:
     """Where the constants of a parameter come from, axes of one source together."""
     axes: dict[str, list[str]] = {}
     for axis in sorted(by_axis):
-        axes.setdefault(_why(by_axis[axis]), []).append(axis)
+        axes.setdefault(fly_with_sentence(by_axis[axis]), []).append(axis)
     if len(axes) == 1:
         return next(iter(axes))
     return " ".join(f"{', '.join(names)}: {source}" for source, names in axes.items())
-
-
-def _why(row: Mapping[str, Any]) -> str:
-    return " ".join(part for part in (fly_with_sentence(row), row.get("why")) if part)
 
 
 def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
@@ -128,7 +126,7 @@ def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
     parts: list[Part] = []
     if set(drift["status"].to_list()) == {"insufficient"}:
         told = f"Too few flights for a trend ({count(usable, 'usable flight')}): every status is insufficient."
-        why = {str(r["reason"]) for r in drift.iter_rows(named=True) if r.get("reason")}
+        why = {str(r["reason"]) for r in drift.iter_rows(named=True) if r["reason"]}
         parts.append(Notice(" ".join([told, *sorted(why)])))
     ordered = sorted(
         drift.iter_rows(named=True),
@@ -221,7 +219,12 @@ def _parameters(warehouse: Warehouse, vehicle_id: str, imus: list[str], drift: p
 
 
 def _sensor(rows: pl.DataFrame, drift: pl.DataFrame, vehicle_id: str, most: int) -> list[Part]:
-    method = preferred(set(rows["method"].to_list()))
+    methods = set(rows["method"].to_list())
+    shown = dict.fromkeys((preferred(methods), *(methods & {WARM_UP})))
+    return [part for method in shown for part in _method(rows, drift, method, vehicle_id, most)]
+
+
+def _method(rows: pl.DataFrame, drift: pl.DataFrame, method: str, vehicle_id: str, most: int) -> list[Part]:
     rows = rows.filter(pl.col("method") == method)
     sensor, imu = rows["sensor"][0], rows["imu_id"][0]
     there = sorted(rows["parameter"].unique().to_list(), key=lambda name: (_place(PARAMETERS, name), name))

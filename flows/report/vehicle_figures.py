@@ -12,7 +12,7 @@ import polars as pl
 from fieldcal.rotation import Array
 from flows.report.page import Plot
 from flows.report.plot import INK, XYZ, headed, legend_below, panels, svg
-from flows.report.trend import REFERENCE_DEGC, days_after, predicted, reference_moment
+from flows.report.trend import REFERENCE_DEGC, days_after, predicted
 from flows.report.words import count, day, unit
 
 MOST_POINTS = 250
@@ -73,7 +73,7 @@ def _panel_row(axes: Any, rows: pl.DataFrame, trend: Mapping[str, Any] | None, v
     used = (rows["status"] == "ok").to_numpy()
     dated = [m for m in moments if m is not None]
     last = max((m for m, ok in zip(moments, used, strict=True) if m is not None and ok), default=None)
-    stated = None if trend is None else reference_moment(trend)
+    stated = None if trend is None else trend["as_of"]
     reference = stated or last or (max(dated) if dated else datetime(1970, 1, 1))
     days = days_after(moments, reference)
     degc, value = (rows[c].cast(pl.Float64).fill_null(float("nan")).to_numpy() for c in ("temperature_degc", "value"))

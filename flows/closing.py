@@ -1,0 +1,97 @@
+"""What closes a night, once its flights are published: the fleet's trends, what is new in them, the reports."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from fieldcal.provenance import source_digest
+from flows import drift, drift_reasons, drift_warm_up
+from flows.drift_changes import Change, changes, last_usable
+from warehouse import Warehouse
+from warehouse.checksums import history_digest
+from warehouse.files import write_bytes
+from warehouse.lock import fleet_lock
+from warehouse.sealed import BrokenSeal, seal, unseal
+
+INPUTS = ("calibration", "fit", "flight", "sync")
+EVENT = "fieldcal.fleet.changed"
+MOST_PAGES = 10
+
+
+@dataclass
+class Closing:
+    """What is new in the fleet, and where its report is."""
+
+    changes: list[Change] = field(default_factory=list)
+    report: Path | None = None
+
+
+def close_night(root: Path) -> Closing:
+    """Bring trends and reports up to the history; what is to be told tonight that was not told before.
+
+    Trends are regressed only where the history, or the code that makes them, is another than last time. Reports: the
+    fleet's page, and the pages of vehicles of which something is told; `fieldcal report` makes any other.
+
+    Raises
+    ------
+    WarehouseError
+        As `flows.drift.update_drift`; `busy`.
+    """
+    now = datetime.now(UTC)
+    with fleet_lock(root):
+        before = _remembered(root)
+        former = Warehouse(root).scan("drift").collect()
+        made_from = _made_from(root)
+        if before.get("made_from") != made_from or before.get("made") != history_digest(root, ["drift"]):
+            drift.update_drift(root)
+        table = Warehouse(root).scan("drift").collect()
+        since = datetime.fromisoformat(before["at"]) if "at" in before else None
+        told = changes(former, table, last_usable(root), now=now, since=since)
+        record = {"at": now.isoformat(), "made_from": made_from, "made": history_digest(root, ["drift"])}
+        write_bytes(_place(root), seal(record), durable=False)
+        return Closing(told, _reports(root, told))
+
+
+def tell_prefect(told: Sequence[Change]) -> None:
+    """Emit `fieldcal.fleet.changed`, on which an automation can act; without news nothing is emitted."""
+    if not told:
+        return
+    from prefect.events import emit_event
+
+    emit_event(
+        event=EVENT,
+        resource={"prefect.resource.id": "fieldcal.fleet"},
+        payload={"changes": [change.row() for change in told]},
+    )
+
+
+def _reports(root: Path, told: Sequence[Change]) -> Path:
+    from flows.report import write_night_reports
+
+    vehicles = list(dict.fromkeys(change.vehicle_id for change in told if change.kind not in ("expired", "idle")))
+    return write_night_reports(root, vehicles[:MOST_PAGES])[0]
+
+
+def _made_from(root: Path) -> str:
+    """Digest of what trends are made from: the history and the code."""
+    digest = hashlib.sha256(history_digest(root, INPUTS).encode())
+    digest.update(source_digest(drift.update_drift).encode())
+    for module in (drift, drift_reasons, drift_warm_up):
+        digest.update(Path(str(module.__file__)).read_bytes())
+    return digest.hexdigest()
+
+
+def _remembered(root: Path) -> Mapping[str, Any]:
+    try:
+        return unseal(_place(root).read_bytes())
+    except (OSError, BrokenSeal):
+        return {}
+
+
+def _place(root: Path) -> Path:
+    return root / "night" / "closing.json"
