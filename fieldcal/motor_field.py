@@ -33,13 +33,13 @@ LEVELS = (1.0, 99.0)
 CONSTANT = 9
 """Parameters of the constant ellipsoid: symmetric matrix and offset."""
 
-STEPS = 10
+STEPS = 50
 
 LEAST_SEEN = 1e-3
 """Relative singular value of the regression below which a combination of parameters is left at 0: the flight did not
 show it."""
 
-CONVERGED, FARTHEST = 1e-4, 10.0
+CONVERGED, FARTHEST = 1e-6, 10.0
 """Last step and largest parameter, in local fields, of a solution."""
 
 KNOWN_SD = 3.0
@@ -101,9 +101,9 @@ def motor_field(field: ArrayLike, drive: ArrayLike, strength: float) -> MotorFie
         residual, jacobian = _residual(h, u, theta)
         step = np.linalg.lstsq(jacobian, residual, rcond=LEAST_SEEN)[0]
         theta = theta - step
-        if not np.abs(theta).max() < FARTHEST:
-            return None
-    if np.abs(step).max() > CONVERGED:
+        if np.abs(step).max() < CONVERGED or not np.abs(theta).max() < FARTHEST:
+            break
+    if not (np.abs(step).max() < CONVERGED and np.abs(theta).max() < FARTHEST):
         return None
     residual, jacobian = _residual(h, u, theta)
     covariance = least_squares_covariance(jacobian[:, None, :], residual[:, None])[1][CONSTANT:, CONSTANT:]

@@ -163,7 +163,7 @@ PIPELINE: tuple[Stage, ...] = (
         },
         (),
         ("calibration",),
-        ("field_ned", "field_unit"),
+        ("field_ned", "field_unit", "polarity"),
     ),
     Stage(
         "gyro_equation_pass2",

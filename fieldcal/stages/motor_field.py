@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal import motor_field, sensor
+from fieldcal import ellipsoid, motor_field, sensor
+from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.frames import constants, matrix, triad
 from fieldcal.rotation import Array
 from fieldcal.sensor_sanity import Fault
@@ -26,16 +27,14 @@ DRIVES = {"current_a": ("current", "A"), "throttle": ("throttle", "")}
 
 
 def check_motor_field(tables: Tables, s: Settings) -> tuple[dict[str, Any], list[Fault]]:
-    """power, readings and constants of the magnetometer → measured numbers and faults; both empty without a current.
-
-    Constants of a refused fit serve too: the current may be why it was refused."""
-    if not {"power", "readings", "segments", "magnetometer"} <= tables.keys():
+    """power, readings and constants of the magnetometer → measured numbers and faults; both empty without a current."""
+    if not {"power", "readings", "segments"} <= tables.keys():
         return {}, []
-    known = constants(tables["magnetometer"], "magnetometer", refused_too=True)
     readings = tables["readings"].filter(pl.Series(in_used_segments(tables["readings"], tables["segments"])))
     values = matrix(readings, triad("magnetometer"))
     whole = np.isfinite(values).all(axis=1)
-    if known is None or not all(np.isfinite(c).all() for c in known):
+    known = _approximate(tables, s, values[whole])
+    if known is None:
         return {}, []
     for column, (word, unit) in DRIVES.items():
         power = tables["power"].filter(pl.col(column).is_finite())
@@ -54,6 +53,20 @@ def check_motor_field(tables: Tables, s: Settings) -> tuple[dict[str, Any], list
         numbers = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(found).items()}
         return {"motor_field": {"drive": column, **numbers}}, [fault] if fault else []
     return {}, []
+
+
+def _approximate(tables: Tables, s: Settings, values: Array) -> tuple[Array, Array] | None:
+    """Scale and bias to start from: the magnetometer's, of a refused fit too (the current may be why it was refused),
+    else the algebraic fit's; what a constant ellipsoid lacks is fitted beside the current's field."""
+    own = constants(tables["magnetometer"], "magnetometer", refused_too=True) if "magnetometer" in tables else None
+    if own is not None and all(np.isfinite(c).all() for c in own):
+        return own
+    strength, polarity = float(np.linalg.norm(s["field_ned"])), s["polarity"]["magnetometer"]
+    try:
+        fit = ellipsoid.fit_ellipsoid(values, strength, method="li", polarity=polarity)
+    except (UnusableFlight, EstimationError, ValueError):
+        return None
+    return fit.scale, fit.bias
 
 
 def _drive_at(t_ns: np.ndarray, own_ns: np.ndarray, values: Array) -> Array:
