@@ -42,7 +42,8 @@ show it."""
 CONVERGED, FARTHEST = 1e-6, 10.0
 """Last step and largest parameter, in local fields, of a solution."""
 
-KNOWN_SD = 3.0
+KNOWN_SD, SURE_SD = 3.0, 2.0
+"""A component counts from so many sd on; a share refuses when it is so many sd beyond `FATAL`."""
 
 
 @dataclass(frozen=True)
@@ -146,10 +147,11 @@ def _correlation(residual: Array, jacobian: Array, k: Array) -> float:
 
 
 def motor_fault(found: MotorField, drive: str, drive_unit: str, field_unit: str) -> Fault | None:
-    """The fault that a `MotorField` is: None unless it is significant and beyond the share that is told."""
+    """The fault that a `MotorField` is: None unless it is significant and beyond the share that is told; fatal where it
+    is surely beyond `FATAL`. Units are words for the sentence."""
     if found.p_value > SIGNIFICANT or found.share <= TOLD:
         return None
-    fatal = found.share > FATAL
+    fatal = found.share - SURE_SD * found.share_sd > FATAL
     slope = ", ".join(f"{v:.3g}" for v in found.slope)
     slope_unit = ("local fields" if field_unit == "norm" else field_unit) + f" per {drive_unit or f'full {drive}'}"
     sentence = (

@@ -93,7 +93,9 @@ CURRENT_A = Column(
     "A",
     "current of battery or motors as the log has it; of a ROS BatteryState, negative while discharging, the magnitude",
 )
-THROTTLE = Column("throttle", _F64, "1", "throttle as the log has it, 0 to 1 where it is in its unit")
+THROTTLE = Column(
+    "throttle", _F64, "1", "throttle, 0 to 1 of full; one that is logged in another unit stands as logged and is not used"
+)
 ATTITUDE_SD_RAD = Column(
     "attitude_sd_rad",
     _F64,

@@ -132,6 +132,9 @@ def result_of(share: float, p_value: float) -> MotorField:
 def test_limits_and_sentence() -> None:
     assert motor_fault(result_of(0.5, 2 * SIGNIFICANT), "current", "A", "uT") is None
     assert motor_fault(result_of(TOLD, 0.0), "current", "A", "uT") is None
+    unsure = motor_fault(result_of(FATAL + 0.001, 0.0), "current", "A", "uT")  # its sd is 0.001
+    assert unsure is not None
+    assert not unsure.fatal
     told, fatal = (motor_fault(result_of(share, 0.0), "current", "A", "uT") for share in (0.05, FATAL + 0.01))
     assert told is not None
     assert (told.code, told.value, told.limit, told.fatal) == ("motor_field", 0.05, TOLD, False)
