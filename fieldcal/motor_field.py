@@ -52,9 +52,9 @@ class MotorField:
 
     `slope` (3,): field per unit of drive, sensor axes, in the field's unit; `slope_sd` (3,). `span`: range of the
     drive (1st to 99th percentile). `share`: length of slope times span over the local field, of its components along
-    the covariance's principal axes only those beyond three sd; `share_sd`. `correlation`:
-    of the length's residual with the part that the drive explains, constant ellipsoid taken out of both; `independent`:
-    how many independent samples the residual is worth; `p_value`: of slope = 0.
+    the covariance's principal axes only those beyond three sd; `share_sd`. `correlation`: of the length's residual with
+    the part that the drive explains, constant ellipsoid taken out of both; `independent`: how many independent samples
+    the residual is worth; `p_value`: of slope = 0.
     """
 
     slope: Array
@@ -87,10 +87,11 @@ def motor_field(field: ArrayLike, drive: ArrayLike, strength: float) -> MotorFie
     Returns
     -------
     MotorField or None
-        None where nothing can be said: fewer than 100 samples, a drive that stands, or a fit that does not converge.
+        None where nothing can be said: fewer than 100 samples, readings that are not finite, a drive that stands, or a
+        fit that does not converge.
     """
     h, u = np.asarray(field, dtype=float) / strength, np.asarray(drive, dtype=float)
-    if len(h) < FEWEST:
+    if len(h) < FEWEST or not np.isfinite(h).all():
         return None
     low, high = np.percentile(u, LEVELS)
     span = float(high - low)
@@ -132,7 +133,7 @@ def _residual(h: Array, u: Array, theta: Array) -> tuple[Array, Array]:
     soft = np.eye(3) + np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     corrected = h @ soft.T + theta[6:9] - u[:, None] * theta[9:]
     length = np.linalg.norm(corrected, axis=1)
-    e = corrected / length[:, None]
+    e = corrected / np.maximum(length, np.finfo(float).tiny)[:, None]
     crossed = [2.0 * e[:, i] * e[:, j] for i, j in ((0, 1), (0, 2), (1, 2))]
     return length - 1.0, np.column_stack([e * e, *crossed, e, -u[:, None] * e])
 

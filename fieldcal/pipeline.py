@@ -160,6 +160,7 @@ PIPELINE: tuple[Stage, ...] = (
             "readings": "ingest.magnetometer",
             "segments": "manoeuvre.segments",
             "power": "ingest.power",
+            "sanity": "sanity.faults",
         },
         (),
         ("calibration",),

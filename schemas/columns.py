@@ -94,7 +94,7 @@ CURRENT_A = Column(
     "current of battery or motors as the log has it; of a ROS BatteryState, negative while discharging, the magnitude",
 )
 THROTTLE = Column(
-    "throttle", _F64, "1", "throttle, 0 to 1 of full; one that is logged in another unit stands as logged and is not used"
+    "throttle", _F64, "1", "throttle, 0 to 1 of full; what is logged in another unit stands as logged and is not used"
 )
 ATTITUDE_SD_RAD = Column(
     "attitude_sd_rad",

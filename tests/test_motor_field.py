@@ -123,6 +123,8 @@ def test_what_says_nothing() -> None:
     h = field_ut()
     assert motor_field(h, np.full(len(h), 12.0), FIELD_UT) is None
     assert motor_field(h[:50], np.arange(50.0), FIELD_UT) is None
+    assert motor_field(np.zeros_like(h), np.arange(float(len(h))), FIELD_UT) is None
+    assert motor_field(h * np.inf, np.arange(float(len(h))), FIELD_UT) is None
 
 
 def result_of(share: float, p_value: float) -> MotorField:

@@ -11,6 +11,7 @@ import polars as pl
 from fieldcal import ellipsoid, motor_field, sensor
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.frames import constants, matrix, triad
+from fieldcal.results import fatal_fault
 from fieldcal.rotation import Array
 from fieldcal.sensor_sanity import Fault
 from fieldcal.stages.inputs import Settings, Tables, in_used_segments
@@ -27,12 +28,17 @@ DRIVES = {"current_a": ("current", "A"), "throttle": ("throttle", "")}
 
 
 def check_motor_field(tables: Tables, s: Settings) -> tuple[dict[str, Any], list[Fault]]:
-    """power, readings and constants of the magnetometer → measured numbers and faults; both empty without a current."""
+    """power, readings and constants of the magnetometer → measured numbers and faults; both empty without a current, and
+    where the readings are insane already."""
     if not {"power", "readings", "segments"} <= tables.keys():
+        return {}, []
+    if "sanity" in tables and fatal_fault(tables["sanity"], ("magnetometer",)) is not None:
         return {}, []
     readings = tables["readings"].filter(pl.Series(in_used_segments(tables["readings"], tables["segments"])))
     values = matrix(readings, triad("magnetometer"))
     whole = np.isfinite(values).all(axis=1)
+    if np.count_nonzero(whole) < motor_field.FEWEST:
+        return {}, []
     known = _approximate(tables, s, values[whole])
     if known is None:
         return {}, []
