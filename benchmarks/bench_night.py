@@ -3,7 +3,7 @@
     python benchmarks/bench_night.py [--workers 2] [--flights 200] [--archive FOLDER]
 
 Orchestration is all of the wall time that is neither the stages' own work (reading input, computing, writing output;
-summed over the workers and divided by their number) nor the wait for Prefect's server to start.
+summed over the workers and divided by their number) nor the start of Prefect (its import and its server).
 """
 
 from __future__ import annotations

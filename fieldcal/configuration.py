@@ -20,8 +20,7 @@ from fieldcal.parameters import PARAMETERS, PROFILES, Value
 from fieldcal.toml_checks import Place, Triple
 
 SENSORS = ("magnetometer", "accelerometer", "gyroscope")
-METHODS = ("serial",)
-METHODS_TO_COME = ("joint",)
+METHODS = ("serial", "joint")
 UNITS = {
     "magnetometer": ("counts", "T", "uT", "G", "norm"),
     "accelerometer": ("counts", "m/s^2", "g"),
@@ -180,12 +179,6 @@ def _units(value: Any, place: Place) -> dict[str, str]:
     return {sensor: check.choice(unit, place / sensor, UNITS[sensor]) for sensor, unit in raw.items()}
 
 
-def _method(value: Any, place: Place) -> str:
-    if value in METHODS_TO_COME:
-        place.fail("method_not_available", f'this version has only method "{METHODS[0]}", not "{value}"')
-    return check.choice(value, place, METHODS)
-
-
 def _field(value: Any, place: Place) -> Field:
     raw = check.table(value, place, ("north_east_down", "unit", "latitude_deg", "longitude_deg", "altitude_m"))
     if "north_east_down" in raw:
@@ -237,6 +230,8 @@ def _imu_fields(value: Any, place: Place) -> dict[str, Paths]:
 
 
 def _parameters(value: Any, place: Place) -> dict[str, Value]:
+    if isinstance(value, dict) and value.get("use_vps") is True:
+        (place / "use_vps").fail("not_available", "this version cannot use the VPS in the estimate; leave it false")
     return {key: _parameter(key, item, place / key) for key, item in check.table(value, place, PARAMETERS).items()}
 
 
@@ -274,7 +269,7 @@ _MCAP_KEYS: dict[str, Callable[[Any, Place], Any]] = {
 }
 _VEHICLE_KEYS: dict[str, Callable[[Any, Place], Any]] = {
     "imu_id": check.text,
-    "method": _method,
+    "method": partial(check.choice, allowed=METHODS),
     "profile": partial(check.choice, allowed=PROFILES),
     "world": partial(check.choice, allowed=("ned", "enu")),
     "body": partial(check.choice, allowed=("frd", "flu")),

@@ -52,6 +52,7 @@ def flight_settings(
     field, field_unit, source = _local_field(vehicle, unit["magnetometer"], position, started_at)
     return {
         **vehicle.parameters,
+        "method": vehicle.method,
         "units": unit,
         "world": vehicle.world or world or "ned",
         "body": vehicle.body or body or "frd",

@@ -13,7 +13,7 @@ from typing import Any
 import polars as pl
 
 from fieldcal.results import StageResult, fatal_fault
-from fieldcal.stages import attitude, comparison, gyroscope, preparation, sanity, vector_triads, vps, warm_up
+from fieldcal.stages import attitude, comparison, gyroscope, joint, preparation, sanity, vector_triads, vps, warm_up
 
 Run = Callable[[Mapping[str, pl.DataFrame], Mapping[str, Any]], StageResult]
 
@@ -201,6 +201,36 @@ PIPELINE: tuple[Stage, ...] = (
         ("gyroscope",),
     ),
     Stage(
+        "joint",
+        joint.estimate_jointly,
+        {
+            **SAMPLES,
+            "imu": "ingest.imu",
+            "magnetometer_log": "ingest.magnetometer",
+            "magnetometer": "magnetometer.calibration",
+            "accelerometer": "accelerometer_pass2.calibration",
+            "gyroscope": "gyro_output.calibration",
+        },
+        (),
+        ("calibration", "covariance", "attitude", "held_out"),
+        (
+            *AXES,
+            "method",
+            "polarity",
+            "units",
+            "nominal_scale",
+            "reference_reading",
+            "field_ned",
+            "field_unit",
+            "gravity_mps2",
+            "gravity_sign",
+            "lever_arm_m",
+            "ellipsoid_max_scale_sd",
+            "ellipsoid_max_residual",
+            "gyro_max_scale_sd",
+        ),
+    ),
+    Stage(
         "vps_sync",
         vps.synchronise_vps,
         {
@@ -208,6 +238,8 @@ PIPELINE: tuple[Stage, ...] = (
             "vps": "ingest.vps",
             "attitude": "attitude_pass2.attitude",
             "gyroscope": "gyro_output.calibration",
+            "joint": "joint.calibration",
+            "joint_attitude": "joint.attitude",
             **FAULTS,
         },
         ("imu",),
@@ -225,8 +257,11 @@ PIPELINE: tuple[Stage, ...] = (
             "attitude": "attitude_pass2.attitude",
             "gyroscope": "gyro_output.calibration",
             "vps_aligned": "vps_sync.vps_aligned",
+            "joint": "joint.calibration",
+            "joint_attitude": "joint.attitude",
+            "joint_held_out": "joint.held_out",
         },
-        ("samples", "attitude"),
+        ("samples",),
         ("fit",),
         (*VECTORS, *SMOOTHING, "differentiation_window_s", "initial_attitude"),
     ),
@@ -237,6 +272,7 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
     "calibration": (
         "vectors.calibration",
         "gyro_output.calibration",  # equation error's rows too
+        "joint.calibration",
         "warm_up.calibration",
     ),
     "fit": ("verify.fit",),

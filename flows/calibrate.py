@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +44,13 @@ def run_log(
     vehicle_id: str | None = None,
     session_id: str | None = None,
     profile: str | None = None,
+    method: str | None = None,
     changes: dict[str, str] | None = None,
 ) -> CalibratedLog:
     """Calibrate one log; what it says, and all tables on the way.
 
     Vehicle and session are taken from the folders the log lies in, `<vehicle>/<session>/<log>`, unless given; the
-    configuration from `fieldcal.toml` above them, unless given. `profile` and `changes` overrule its parameters.
+    configuration from `fieldcal.toml` above them, unless given. `profile`, `method` and `changes` overrule its own.
 
     Raises
     ------
@@ -64,6 +65,8 @@ def run_log(
     vehicle_id = vehicle_id or log.parent.parent.name
     job = _job(log, vehicle_id, session_id or log.parent.name, archive)
     vehicle = with_parameters(configuration.vehicle(vehicle_id), profile, changes or {})
+    if method is not None:
+        vehicle = replace(vehicle, method=method)
     signals, facts = ingest.read_flight(log, vehicle)
     records: dict[str, dict[str, Any]] = {INGEST: _record(_ingest_result(facts))}
     settings: dict[str, Any] = {}

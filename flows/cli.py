@@ -66,7 +66,7 @@ def calibrate(
     /,
     *,
     vehicle: str | None = None,
-    method: Annotated[Literal["serial"], Parameter(show_choices=True)] = "serial",
+    method: Literal["serial", "joint"] | None = None,
     profile: Literal["full", "onboard", "paper"] | None = None,
     set_: Annotated[list[str] | None, Parameter(name="--set")] = None,
     report: Annotated[Path | None, Parameter(help="Write the flight's report to this HTML file too.")] = None,
@@ -83,7 +83,7 @@ def calibrate(
     vehicle
         The vehicle in fieldcal.toml; else the folder two levels above the log.
     method
-        How the sensors are calibrated.
+        "serial", one step after the other, or "joint", all in one likelihood; else what fieldcal.toml says.
     profile
         Presets of the stages.
     set_
@@ -92,7 +92,8 @@ def calibrate(
     from flows.calibrate import run_log
     from flows.show import console, print_json, say
 
-    result = run_log(log, config, vehicle_id=vehicle, profile=profile, changes=_assignments(set_ or []))
+    changes = _assignments(set_ or [])
+    result = run_log(log, config, vehicle_id=vehicle, profile=profile, method=method, changes=changes)
     document = result.document
     if report is not None:
         from flows.report import log_report

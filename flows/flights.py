@@ -9,6 +9,7 @@ from typing import Any
 from fieldcal.configuration import Configuration
 from flows.jobs import Job, Source, configuration_of
 from flows.outcome import Outcome, failed_outcome
+from flows.source_ledger import know_sources
 from flows.steps import STEPS, FlightWork, Record, code_digest, sentence
 from flows.threads import one_thread
 from warehouse.errors import WarehouseError
@@ -68,6 +69,7 @@ def flights(
     outcomes: list[dict[str, Any]] = []
     if code_digest() != code:
         return {"outcomes": outcomes, "error": OTHER_CODE}
+    know_sources(Path(root), keep=False)
     settings = configuration_of(source)
     try:
         with one_thread():

@@ -15,22 +15,27 @@ if TYPE_CHECKING:
     from prefect.client.schemas.filters import FlowRunFilter
 
 KEPT_DAYS = 30
+EVERY_S = 3600.0
 AT_ONCE = 200
 
 
 def tidy_prefect(root: Path, url: str, *, own_server: bool) -> None:
-    """End the runs of killed processes and, on a server of ours, remove runs older than `KEPT_DAYS`."""
+    """End the runs of killed processes and, on a server of ours, once an hour, remove runs older than `KEPT_DAYS`."""
     from prefect.client.orchestration import get_client
     from prefect.settings import PREFECT_API_URL, temporary_settings
 
     marks = dead(root)
-    if not marks and not own_server:
+    last = root / "prefect" / "tidied"
+    due = own_server and not (last.exists() and time.time() - last.stat().st_mtime < EVERY_S)
+    if not marks and not due:
         return
     with temporary_settings({PREFECT_API_URL: url}), get_client(sync_client=True) as client:
         for mark in marks:
             _end(client, mark)
-        if own_server:
+        if due:
             _remove_old(client)
+            last.parent.mkdir(parents=True, exist_ok=True)
+            last.touch()
 
 
 def _end(client: SyncPrefectClient, mark: Path) -> None:

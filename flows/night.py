@@ -26,16 +26,16 @@ def run_night(
     """Run the flow `nightly`, or `session` for that folder of the archive; its JSON, with how long it took.
 
     `where` may hold `runner` and `scheduler` (`flows.runners`). `seconds` is the whole duration, `server_seconds` what
-    of it the command waited for Prefect's server, `stage_seconds` the stages' own work, summed over the workers.
+    importing Prefect took until its server answered, `stage_seconds` the stages' own work, summed over the workers.
     """
     began = time.monotonic()
     find_source(config, archive)
     prepare(root)
     with running_server(root) as server:
+        waiting = time.monotonic()
         from flows.housekeeping import tidy_prefect
         from flows.nightly import run_nightly
 
-        waiting = time.monotonic()
         url = server.wait()
         ready = time.monotonic()
         tidy_prefect(root, url, own_server=server.own)

@@ -35,6 +35,7 @@ from flows.plan import Plan, make_plan
 from flows.pool import hand_over
 from flows.runners import Parallel, answers, batches
 from flows.show import say
+from flows.source_ledger import know_sources
 from flows.steps import FlightWork, Record, code_digest
 from flows.watching import Watcher, tell_done, tell_plan, watch
 from warehouse import Warehouse
@@ -157,6 +158,7 @@ def _night(root_of_logs: Path, root: Path, config: str | None, only: Path | None
     prepare(root)
     remove_abandoned(root)
     with alive(root):
+        know_sources(root, keep=True)
         plan = make_plan(root, root_of_logs, settings, only)
         write_ledger(root, [*plan.jobs, *plan.copied])
         tell_plan(len(plan.jobs), len(plan.missing))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -21,7 +22,7 @@ from fieldcal import ingest
 from fieldcal.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.pipeline import PIPELINE, Stage, run_stage
-from fieldcal.provenance import run_key, source_digest
+from fieldcal.provenance import PROJECT, run_key, source_digest
 from fieldcal.results import StageResult
 from fieldcal.tidy import Disordered
 from flows.jobs import Job, file_stamp
@@ -40,19 +41,33 @@ STAGES: dict[str, Stage] = {stage.name: stage for stage in PIPELINE}
 Record = dict[str, Any]
 
 
-@functools.cache
-def step_sources() -> dict[str, str]:
+_sources: dict[str, str] = {}
+
+
+def step_sources() -> Mapping[str, str]:
     """Digest of the source of every step, taken once in a process: what runs is what was imported."""
-    functions: dict[str, Callable[..., Any]] = {
-        INGEST: ingest.tidy_log,
-        **{name: stage.function for name, stage in STAGES.items()},
-    }
-    return {step: source_digest(function) for step, function in functions.items()}
+    if not _sources:
+        functions: dict[str, Callable[..., Any]] = {name: stage.function for name, stage in STAGES.items()}
+        functions[INGEST] = ingest.tidy_log
+        _sources.update({step: source_digest(function) for step, function in functions.items()})
+    return _sources
 
 
+def take_sources(sources: Mapping[str, str]) -> None:
+    """Take digests that were worked out from the same code (`code_digest`)."""
+    _sources.update(sources)
+
+
+@functools.cache
 def code_digest() -> str:
-    """One digest for the source of all steps, by which processes that share a night tell that they run the same."""
-    return hashlib.sha256(repr(sorted(step_sources().items())).encode()).hexdigest()
+    """One digest of all code that steps may reach, by which the processes of a night tell that they run the same."""
+    digest = hashlib.sha256()
+    for package in PROJECT:
+        folder = Path(str(importlib.import_module(package).__file__)).parent
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(f"{package}/{path.relative_to(folder).as_posix()}\0".encode())
+            digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
 
 
 class FlightWork:

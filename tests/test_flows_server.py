@@ -169,6 +169,7 @@ def test_old_runs_are_removed_with_their_tasks(
 
     monkeypatch.setattr(housekeeping, "_ended_before", narrowed)
     monkeypatch.setattr(housekeeping, "KEPT_DAYS", 0)
+    monkeypatch.setattr(housekeeping, "EVERY_S", 0.0)
     housekeeping.tidy_prefect(tmp_path, prefect_server, own_server=True)
     assert own not in flow_runs(prefect_server)
     assert tasks() == 0

@@ -12,7 +12,7 @@ from fieldcal import attitude as wahba
 from fieldcal import sensor, smoothing
 from fieldcal.frames import QUATERNION, constants, matrix, seconds, triad
 from fieldcal.gyro_equation import predicted_quaternion_rate
-from fieldcal.gyro_output import propagate_stretches, start_stretches
+from fieldcal.gyro_output import propagate_stretches, shooting_segments, start_stretches
 from fieldcal.manoeuvre import contiguous
 from fieldcal.metrics import Fit, theil, theil_attitude
 from fieldcal.results import StageResult
@@ -20,6 +20,8 @@ from fieldcal.rotation import Array, continuous, slerp
 from fieldcal.stages.attitude import body_vectors, known_vectors, sensor_attitude
 from fieldcal.stages.inputs import Settings, Tables, differentiate_by_segment, spread_of
 from fieldcal.stages.vps import BRIDGE_S, RATE_COLUMNS, bridged, interpolate_attitude
+
+HELD_OUT_STRETCH_S = 10.0
 
 FIT_SCHEMA = {
     "quantity": pl.String,
@@ -39,11 +41,12 @@ FIT_SCHEMA = {
 
 def verify_fit(tables: Tables, s: Settings) -> StageResult:
     """Everything estimated → fit: the paper's five TICs and one more, raw and smoothed, with physical units."""
-    samples, attitude = tables["samples"], tables["attitude"]
+    samples, attitude = tables["samples"], tables.get("attitude")
     t = seconds(samples["t_ns"], int(samples["t_ns"][0]))
     segment = samples["segment"].to_numpy()
-    smoothed_q = matrix(attitude, QUATERNION)
-    sides = {"raw": _raw_attitude(tables, s), "smoothed": smoothed_q}
+    sides = {}
+    if attitude is not None:
+        sides = {"raw": _raw_attitude(tables, s), "smoothed": matrix(attitude, QUATERNION)}
     gyros = {
         method: constants(tables["gyroscope"], "gyroscope", method, refused_too=True)
         for method in ("equation_error", "output_error")
@@ -54,8 +57,10 @@ def verify_fit(tables: Tables, s: Settings) -> StageResult:
     axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
     rows: list[dict[str, Any]] = []
 
-    def add(quantity: str, method: str, reference: str, signal: str, fit: Fit, unit: str) -> None:
-        rows.append(_fit_row(quantity, method, reference, signal, fit, unit))
+    def add(
+        quantity: str, method: str, reference: str, signal: str, fit: Fit, unit: str, sample: str = "all"
+    ) -> None:
+        rows.append(_fit_row(quantity, method, reference, signal, sample, fit, unit))
 
     name = s["attitude"]
     for signal, q in sides.items():
@@ -83,30 +88,39 @@ def verify_fit(tables: Tables, s: Settings) -> StageResult:
                 )
             else:
                 relative = propagate_stretches(t, rate, segment)
-                weight = attitude["weight"].to_numpy()
+                weight = np.ones(len(t)) if attitude is None else attitude["weight"].to_numpy()
                 model = start_stretches(relative, q_sensor, segment, weight, fixed=s["initial_attitude"] == "fixed")
                 add("attitude_propagated", method, name, signal, theil_attitude(q_sensor, model), "deg")
                 if vps is not None and vps_t is not None:
-                    _propagated_against_vps(add, signal, t, relative, segment, vps, vps_t, s)
+                    _propagated_against_vps(add, method, signal, t, relative, segment, vps, vps_t, s)
             if vps is not None and vps_t is not None:
-                near = bridged(t, vps_t)
-                if near.any():
-                    body = np.column_stack([np.interp(vps_t, t, c) for c in (rate @ axes.T).T])
-                    vps_rate = matrix(vps, RATE_COLUMNS)
-                    if signal == "smoothed":
-                        vps_rate = _smoothed_blocks(vps_t, vps_rate, s)
-                    add("body_rate", method, "vps", signal, theil(vps_rate[near], body[near]), "rad/s")
+                _rates_against_vps(add, method, signal, t, rate @ axes.T, vps, vps_t, s)
+    joint = constants(tables["joint"], "gyroscope") if "joint" in tables else None
+    if joint is not None and vps is not None and vps_t is not None:
+        q = matrix(tables["joint_attitude"], QUATERNION)
+        own, near = interpolate_attitude(t, continuous(q), vps_t)
+        if near.any():
+            add("attitude", "joint", "vps", "smoothed", theil_attitude(matrix(vps, QUATERNION)[near], own[near]), "deg")
+        for signal, prefix in (("raw", ""), ("smoothed", "smoothed_")):
+            rate = sensor.calibrate(matrix(samples, triad("gyroscope", prefix)), *joint)
+            relative = propagate_stretches(t, rate, segment)
+            _propagated_against_vps(add, "joint", signal, t, relative, segment, vps, vps_t, s)
+            _rates_against_vps(add, "joint", signal, t, rate @ axes.T, vps, vps_t, s)
+    if "joint_held_out" in tables:
+        _held_out(add, tables, t, segment, vps, vps_t, s)
     if not rows:
         return StageResult(status="absent", reason_code="nothing_to_compare", reason="No reference to compare with.")
     return StageResult({"fit": pl.DataFrame(rows, schema=FIT_SCHEMA)}, measured={"comparisons": len(rows)})
 
 
-def _fit_row(quantity: str, method: str, reference: str, signal: str, fit: Fit, unit: str) -> dict[str, Any]:
+def _fit_row(
+    quantity: str, method: str, reference: str, signal: str, sample: str, fit: Fit, unit: str
+) -> dict[str, Any]:
     parts = [v if np.isfinite(v) else None for v in (fit.bias, fit.variance, fit.covariance)]
     return dict(
         zip(
             FIT_SCHEMA,
-            (quantity, method, reference, signal, "all", float(fit.tic), *parts, fit.rms, unit, fit.n_samples),
+            (quantity, method, reference, signal, sample, float(fit.tic), *parts, fit.rms, unit, fit.n_samples),
             strict=True,
         )
     )
@@ -122,8 +136,71 @@ def _raw_attitude(tables: Tables, s: Settings) -> Array:
     return wahba.attitudes(vectors, reference, sigma, method=s["attitude"], declination=declination).q
 
 
+def _held_out(
+    add: Callable[..., None],
+    tables: Tables,
+    t: Array,
+    segment: np.ndarray,
+    vps: pl.DataFrame | None,
+    vps_t: Array | None,
+    s: Settings,
+) -> None:
+    """Constants of the first part of the flight predict the rest: attitude over stretches, and body rates, against the
+    VPS, else against the joint attitude of the whole flight."""
+    constants_then = constants(tables["joint_held_out"], "gyroscope")
+    if constants_then is None:
+        return
+    late = tables["samples"]["t_ns"].to_numpy() >= tables["joint_held_out"]["from_ns"][0]
+    t, segment = t[late], segment[late]
+    rate = sensor.calibrate(matrix(tables["samples"], triad("gyroscope"))[late], *constants_then)
+    if vps is not None and vps_t is not None:
+        name, reference_t, q = "vps", vps_t, matrix(vps, QUATERNION)
+        rates = matrix(vps, RATE_COLUMNS)
+    elif "joint_attitude" in tables:
+        name, reference_t, q = "joint", t, matrix(tables["joint_attitude"], QUATERNION)[late]
+        rates = None
+    else:
+        return
+    stretch = shooting_segments(t, segment, HELD_OUT_STRETCH_S)
+    near = bridged(t, reference_t) & (reference_t >= t[0])
+    if near.sum() < 10:
+        return
+    own = slerp(t, propagate_stretches(t, rate, stretch), reference_t)[near]
+    part = stretch[np.clip(np.searchsorted(t, reference_t, side="right") - 1, 0, len(t) - 1)][near]
+    to_sensor = sensor_attitude(q, s)[near]
+    model = start_stretches(own, to_sensor, part, np.ones(len(own)), fixed=False)
+    fit = theil_attitude(continuous(to_sensor), model)
+    add("attitude_propagated", "joint", name, "raw", fit, "deg", "held_out")
+    if rates is not None:
+        axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+        body = np.column_stack([np.interp(reference_t[near], t, c) for c in (rate @ axes.T).T])
+        add("body_rate", "joint", name, "raw", theil(rates[near], body), "rad/s", "held_out")
+
+
+def _rates_against_vps(
+    add: Callable[..., None],
+    method: str,
+    signal: str,
+    t: Array,
+    rate: Array,
+    vps: pl.DataFrame,
+    vps_t: Array,
+    s: Settings,
+) -> None:
+    """Body rates (n, 3), rad/s, against those of the VPS."""
+    near = bridged(t, vps_t)
+    if not near.any():
+        return
+    body = np.column_stack([np.interp(vps_t, t, c) for c in rate.T])
+    vps_rate = matrix(vps, RATE_COLUMNS)
+    if signal == "smoothed":
+        vps_rate = _smoothed_blocks(vps_t, vps_rate, s)
+    add("body_rate", method, "vps", signal, theil(vps_rate[near], body[near]), "rad/s")
+
+
 def _propagated_against_vps(
     add: Callable[..., None],
+    method: str,
     signal: str,
     t: Array,
     relative: Array,
@@ -140,7 +217,7 @@ def _propagated_against_vps(
     if len(own) < 10:
         return
     model = start_stretches(own, reference, part, np.ones(len(own)), fixed=False)
-    add("attitude_propagated", "output_error", "vps", signal, theil_attitude(continuous(reference), model), "deg")
+    add("attitude_propagated", method, "vps", signal, theil_attitude(continuous(reference), model), "deg")
 
 
 def _smoothed_blocks(t: Array, x: Array, s: Settings) -> Array:

@@ -24,6 +24,7 @@ from fieldcal.rotation import (
 )
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Settings, Tables
+from fieldcal.sync_attitude import refine_by_attitude
 
 NED_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # rotation of ENU components to NED
 
@@ -81,6 +82,17 @@ def synchronise_vps(tables: Tables, s: Settings) -> StageResult:
             {"status": "refused", "peak": error.measured.get("peak"), "runner_up": error.measured.get("runner_up")}
         )
         return StageResult({"sync": row}, "refused", error.reason_code, str(error), {**measured, **error.measured})
+    if "joint_attitude" in tables:
+        own_attitude = tables["joint_attitude"]
+        fit = refine_by_attitude(
+            seconds(own_attitude["t_ns"], origin),
+            matrix(own_attitude, QUATERNION),
+            own_attitude["segment"].to_numpy(),
+            t_vps,
+            q_vps,
+            fit,
+        )
+        measured["synchronised_by"] = "attitude"
     row = _sync_row(
         {
             "lag_s": fit.lag_s - base_ns * 1e-9,
@@ -109,7 +121,10 @@ def _sync_row(values: dict[str, Any]) -> pl.DataFrame:
 
 
 def _gyro_constants(tables: Tables, s: Settings) -> tuple[Array, Array] | None:
-    """Output error's constants, else equation error's, else what the logged unit says, else None."""
+    """The joint estimate's constants, else output error's, equation error's, what the logged unit says, or None."""
+    own = constants(tables["joint"], "gyroscope") if "joint" in tables else None
+    if own is not None:
+        return own
     for method in ("output_error", "equation_error"):
         own = constants(tables["gyroscope"], "gyroscope", method) if "gyroscope" in tables else None
         if own is not None:
@@ -148,11 +163,12 @@ def _aligned(
     q = multiply(q, body)
     vps_rate = sensor_rotation(vps_rate, body)
     world = np.array([0.0, 0.0, 0.0, 1.0])
-    if "attitude" in tables:
+    attitude = tables.get("joint_attitude", tables.get("attitude"))
+    if attitude is not None:
         origin = int(tables["imu"]["t_ns"][0])
-        own_t = seconds(tables["attitude"]["t_ns"], origin)
-        own_q, near = interpolate_attitude(own_t, matrix(tables["attitude"], QUATERNION), t)
-        trust = np.interp(t, own_t, tables["attitude"]["weight"].to_numpy())
+        own_t = seconds(attitude["t_ns"], origin)
+        own_q, near = interpolate_attitude(own_t, matrix(attitude, QUATERNION), t)
+        trust = np.interp(t, own_t, attitude["weight"].to_numpy())
         if near.any():
             world = mean_quaternion(multiply(own_q[near], conjugate(q[near])), trust[near])
             q = multiply(world, q)

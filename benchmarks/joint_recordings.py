@@ -1,0 +1,98 @@
+"""Open-loop attitude drift on real recordings with optical poses: gyroscope as logged, after serial, after joint.
+
+    python benchmarks/joint_recordings.py ARCHIVE LOG [LOG …]
+
+ARCHIVE holds fieldcal.toml and `expected.json` with reference gyroscope constants (`truth.gyro` of each log, rad/s);
+LOGs are relative to it. The gyroscope is integrated over each contiguous segment from its best start and compared with
+the optical attitude (rms angle, degrees); constants are compared with the reference in their stated standard deviations
+(both sides' variances added; logs in counts, whose reference is of another unit, are skipped there).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fieldcal import ingest
+from fieldcal.configuration import load
+from fieldcal.frames import AXES, QUATERNION, matrix, seconds, triad
+from fieldcal.gyro_output import propagate_stretches, start_stretches
+from fieldcal.pipeline import run_flight
+from fieldcal.results import StageResult
+from fieldcal.rotation import angle_between, slerp
+from fieldcal.stages.attitude import sensor_attitude
+from fieldcal.stages.vps import bridged
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("archive", type=Path)
+    parser.add_argument("log", nargs="+")
+    given = parser.parse_args()
+    configuration = load(given.archive / "fieldcal.toml")
+    reference = json.loads((given.archive / "expected.json").read_text())
+    print("| log | raw | serial | joint | joint gyroscope against reference, sd (scale x y z, bias x y z) |")
+    print("|---|---|---|---|---|")
+    for name in given.log:
+        path = given.archive / name
+        vehicle = configuration.vehicle(path.parent.parent.name)
+        signals, facts = ingest.read_flight(path, vehicle)
+        settings = ingest.settings_of(facts, vehicle) | {"method": "joint"}
+        results = run_flight(signals, settings)
+        drift = [_raw_drift(results, settings), *(_drift(results, m) for m in ("output_error", "joint"))]
+        cells = ["–" if value is None else f"{value:.2f}°" for value in drift]
+        print(f"| {name} | " + " | ".join(cells) + f" | {_against(results, settings, reference, name)} |", flush=True)
+
+
+def _drift(results: dict[str, StageResult], method: str) -> float | None:
+    fit = results["verify"].tables.get("fit")
+    if fit is None:
+        return None
+    rows = fit.filter(quantity="attitude_propagated", method=method, reference="vps", signal="raw", sample="all")
+    return float(rows["rms"][0]) if len(rows) else None
+
+
+def _raw_drift(results: dict[str, StageResult], settings: dict[str, Any]) -> float | None:
+    """The logged unit alone; None for counts."""
+    nominal, vps = settings["nominal_scale"]["gyroscope"], results["vps_sync"].tables.get("vps_aligned")
+    if nominal is None or vps is None:
+        return None
+    samples = results["smoothing"].tables["samples"]
+    origin = int(samples["t_ns"][0])
+    t, at, segment = seconds(samples["t_ns"], origin), seconds(vps["t_ns"], origin), samples["segment"].to_numpy()
+    sign = np.asarray(settings["polarity"]["gyroscope"], dtype=float)
+    rate = matrix(samples, triad("gyroscope")) * np.asarray(nominal) * sign
+    near = bridged(t, at)
+    part = segment[np.clip(np.searchsorted(t, at), 0, len(t) - 1)][near]
+    own = slerp(t, propagate_stretches(t, rate, segment), at)[near]
+    optical = sensor_attitude(matrix(vps, QUATERNION), settings)[near]
+    model = start_stretches(own, optical, part, np.ones(len(own)), fixed=False)
+    return float(np.degrees(np.sqrt(np.mean(angle_between(optical, model) ** 2))))
+
+
+def _against(results: dict[str, StageResult], settings: dict[str, Any], reference: dict[str, Any], name: str) -> str:
+    entry = _entry(reference, name)
+    rows = results["joint"].tables.get("calibration")
+    if rows is None:
+        return f"refused: {results['joint'].reason_code}"
+    if entry is None or settings["units"]["gyroscope"] == "counts":
+        return "no reference in this unit"
+    out = []
+    for parameter, true_key, sd_key in (("scale", "scale", "scale_sd"), ("bias", "bias_rad_s", "bias_sd_rad_s")):
+        for i, axis in enumerate(AXES):
+            row = rows.filter(sensor="gyroscope", parameter=parameter, axis=axis).row(0, named=True)
+            true, sd = entry[true_key][i], entry[sd_key][i]
+            out.append(f"{(row['value'] - true) / np.hypot(row['sd'], sd):+.1f}")
+    return " ".join(out)
+
+
+def _entry(reference: dict[str, Any], name: str) -> dict[str, Any] | None:
+    return None if name not in reference else reference[name]["truth"].get("gyro")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,332 @@
+"""All three triads, attitude, dip and lever arm at once: the joint maximum-likelihood estimator (method `joint`).
+
+"The method is serial in nature, so good estimates must be determined at each step or the error will compound." Here
+nothing is handed on: the gyroscope is integrated between knots (`joint_chain`), every magnetometer and accelerometer
+reading is predicted in its sensor's own logged units (`joint_model`), and Gauss–Newton moves everything together.
+Noise levels (each sensor axis, gyroscope walk, strength of the translation) are estimated beside it as variance
+components, so nothing has to be tuned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fieldcal.errors import EstimationError
+from fieldcal.joint_chain import Joints, Normal, Probe, add_joints, joint_squares, solve_scaled
+from fieldcal.joint_covariance import covariance
+from fieldcal.joint_model import (
+    SENSED,
+    Model,
+    Rows,
+    State,
+    Trajectory,
+    accumulate,
+    layout_of,
+    residuals,
+    sensitivities,
+    trajectory,
+)
+from fieldcal.rotation import Array, body_from_inertial
+from fieldcal.statistics import robust_sigma, white_noise_sigma
+
+# Residual length, sd of a three-axis reading, beyond which a reading loses influence: χ²₃ passes it once in a thousand.
+CLIP = 4.0
+# The translation at the start, and the gyroscope's walk there over what its sample-to-sample noise makes: loose, since
+# the start is wrong by more than noise.
+ACCELERATION_START_MPS2, WALK_START = 0.2, 10.0
+LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
+# At most this multiple of it (a band limit hides a factor of about 4): a field that varies from place to place would
+# otherwise be taken for a gyroscope that walks.
+MOST_WALK = 10.0
+STIFFENING = 4.0
+LEAST_ACCELERATION_MPS2, LEAST_WALK, LEAST_VARIANCE = 2e-3, 1e-9, 1e-8
+MAX_ITERATIONS = 50
+# Settled: every step below this part of what one could claim as standard deviation, every noise level below it too.
+SETTLED = 0.05
+ROUNDING = 1e-8  # of centred parameters, which are of order one: nothing left to gain
+# Wald test of the lever arm, χ²₃: passed by chance once in a thousand.
+LEVER_ARM_GATE = 16.3
+# What is believed before the first reading: relative sd of scales, and of biases in units of the sensed range.
+PRIOR_RELATIVE_SD = 0.5
+VAGUE = 1.0  # rad of dip, m of lever arm
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Noise: `variance` (r,) of each sensor row a sample, units of x; `colour` (r,) its density at low frequency over
+    that of white noise of the same variance; `walk` of the attitude by gyroscope noise, rad²/s; `strength` of the
+    translation, m/s² an axis."""
+
+    variance: Array
+    colour: Array
+    walk: float
+    strength: float
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """The solution in centred coordinates; θ is ordered by `layout`.
+
+    `covariance` (p, p) of θ, coloured-residual form; `information` (p, p) with the knots eliminated; `weight` (m, r)
+    robust weights; `lever_arm_test` the Wald statistic (χ²₃) of a free lever arm, None where it was not tried."""
+
+    model: Model
+    state: State
+    path: Trajectory
+    levels: Levels
+    weight: Array
+    layout: Mapping[str, slice]
+    covariance: Array
+    information: Array
+    iterations: int
+    lever_arm_test: float | None = None
+
+    def constants(self, name: str) -> tuple[Array, Array, Array]:
+        """(λ (3,), b (3,), covariance (6, 6)) of a triad in logged units."""
+        transform = self.model.triads[name].to_logged()
+        value, own = transform @ self.state.values[name], self.layout[name]
+        return value[:3], value[3:], transform @ self.covariance[own, own] @ transform.T
+
+
+def fit_joint(model: Model, start: State, *, free_dip: bool = True, try_lever_arm: bool = True) -> JointFit:
+    """Estimate everything from a start within some tens of per cent.
+
+    Parameters
+    ----------
+    model : Model
+        The record, knots placed.
+    start : State
+        Attitudes of the knots within about 30°, constants with the right polarity. Its lever arm is kept unless
+        `try_lever_arm`.
+    free_dip : bool
+        Estimate the dip angle; otherwise that of the configured field holds.
+    try_lever_arm : bool
+        Estimate the lever arm, and keep it only where it differs from none (Wald test): estimating it on data that do
+        not show it costs accuracy.
+
+    Raises
+    ------
+    EstimationError
+        `joint_singular`, `joint_diverged`.
+
+    Notes
+    -----
+    The likelihood is maximised over the attitudes, with every residual in logged units: that is consistent (a rate or
+    a length in SI units would shrink with its scale). Over the translation, which has a prior of its own, it is
+    integrated; what that adds to the accelerometer's gradient is `_integrated_translation`.
+
+    It cannot see what moves all triads together with the body: a common rotation of the axes, or a field that turns
+    with the vehicle other than hard iron.
+    """
+    free = try_lever_arm and "accelerometer" in model.rows
+    fit = _iterate(model, start, None, dip=free_dip, lever_arm=free)
+    if not free:
+        return fit
+    own = fit.layout["lever_arm"]
+    arm = fit.state.values["lever_arm"]
+    test = float(arm @ np.linalg.solve(fit.covariance[own, own], arm))
+    if test < LEVER_ARM_GATE:
+        without = replace(fit.state, values={**fit.state.values, "lever_arm": np.zeros(3)})
+        fit = _iterate(model, without, fit.levels, dip=free_dip, lever_arm=False)
+    return replace(fit, lever_arm_test=test)
+
+
+def _iterate(model: Model, state: State, levels: Levels | None, *, dip: bool, lever_arm: bool) -> JointFit:
+    """Gauss–Newton with noise levels renewed at every step."""
+    layout, p = layout_of(model, dip=dip, lever_arm=lever_arm)
+    knots, prior = model.knots, _Prior.at(model, state, layout, p)
+    probe = Probe.draw(len(model.at), 3 * len(model.rows), len(knots.index))
+    path = trajectory(model, state)
+    residual = residuals(model, state, path)
+    levels = levels or _first_levels(model, state, path, residual)
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        weight = _robust_weight(model, residual, levels)
+        normal, moved, reaction = _normal_equations(model, state, path, layout, p, weight, levels, probe)
+        joints = Joints(path.jump, moved, levels.walk, state.motion, levels.strength)
+        add_joints(normal, knots, joints, probe)
+        prior.add(normal, state, layout)
+        eliminated, information, gradient = normal.eliminate()
+        gradient[layout["gyroscope"].start + np.arange(3), 0] += _logged_units(model, state, path, levels.walk)
+        if "accelerometer" in layout:
+            own = layout["accelerometer"].start + np.arange(3)
+            gradient[own, 0] += _integrated_translation(model, state, reaction, eliminated[:, :, p + 1])
+        theta = solve_scaled(information, gradient)
+        step, response = (eliminated[:, :, p + i] - eliminated[:, :, :p] @ theta[:, i] for i in (0, 1))
+        least = _least_part(state, step, theta[:, 0], layout)
+        state = state.moved(least * step, least * theta[:, 0], layout)
+        path = trajectory(model, state)
+        residual = residuals(model, state, path)
+        if not np.isfinite(residual).all():
+            break
+        absorbed = np.einsum("kcr,kc->r", reaction[0], response[:, SENSED]) + reaction[1].T @ theta[:, 1]
+        joints = replace(joints, jump=path.jump, motion=state.motion)
+        squares = joint_squares(knots, joints, response, theta[:, 1], probe)
+        renewed = _levels(model, residual, levels, absorbed, squares, MOST_WALK * gyro_walk(model, state))
+        change, levels = _largest_change(levels, renewed), renewed
+        claimed = 1.0 / np.sqrt(np.diagonal(information))
+        largest = float(np.max(np.abs(theta[:, 0])))
+        settled = max(change, float(np.max(np.abs(theta[:, 0]) / claimed))) < SETTLED
+        if settled or largest < ROUNDING:
+            coloured = covariance(
+                model,
+                sensitivities(model, state, path, layout, p),
+                eliminated[:, :, :p],
+                information,
+                _whitening(weight, levels),
+            )
+            return JointFit(model, state, path, levels, weight, layout, coloured, information, iteration)
+    raise EstimationError(
+        "joint_diverged",
+        "The joint estimate found no minimum: the readings contradict each other or the start is too far off.",
+        {"iterations": iteration},
+    )
+
+
+def _whitening(weight: Array, levels: Levels) -> Array:
+    """Robust weights over what low-frequency noise the rows carry, (m, r), 1/x²."""
+    return np.asarray(weight / (levels.variance * levels.colour))
+
+
+def _normal_equations(
+    model: Model,
+    state: State,
+    path: Trajectory,
+    layout: Mapping[str, slice],
+    p: int,
+    weight: Array,
+    levels: Levels,
+    probe: Probe,
+) -> tuple[Normal, Array, tuple[Array, Array]]:
+    """Those of the sensors; ∂(integrated attitude)/∂θ (K−1, 3, p); and every row's own reaction to the probe."""
+    knots, rows = len(model.knots.index), 3 * len(model.rows)
+    normal = Normal.empty(knots, p, 2)
+    reaction = np.zeros((knots, len(SENSED), rows)), np.zeros((p, rows))
+    moved = np.zeros((knots, 3, p))
+    whitening = _whitening(weight, levels)
+    chunk: Rows
+    for ties, chunk, ends in sensitivities(model, state, path, layout, p):
+        accumulate(normal, model, chunk, ties, whitening[chunk.own], probe, reaction)
+        moved[ties] = ends
+    return normal, moved[:-1], reaction
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """Vague belief about constants, so that directions that the record does not show stay where they started."""
+
+    mean: Array
+    information: Array
+
+    @classmethod
+    def at(cls, model: Model, state: State, layout: Mapping[str, slice], p: int) -> _Prior:
+        mean, sd = np.zeros(p), np.full(p, VAGUE)
+        for name, own in layout.items():
+            mean[own] = state.values[name]
+            if name in model.triads:
+                sd[own] = PRIOR_RELATIVE_SD * np.tile(np.abs(state.values[name][:3]), 2)
+        if "lever_arm" in layout:
+            mean[layout["lever_arm"]] = 0.0
+        return cls(mean, 1.0 / sd**2)
+
+    def add(self, normal: Normal, state: State, layout: Mapping[str, slice]) -> None:
+        now = np.concatenate([state.values[name] for name in layout])
+        normal.parameters[np.diag_indices(len(now))] += self.information
+        normal.parameters_right[:, 0] += self.information * (self.mean - now)
+
+
+def _least_part(state: State, step: Array, theta: Array, layout: Mapping[str, slice]) -> float:
+    """Part of a step that may be taken: no attitude by more than LARGEST_TURN_RAD, no scale by LARGEST_RELATIVE."""
+    longest = [float(np.max(np.abs(step[:, :3]))) / LARGEST_TURN_RAD]
+    for name, own in layout.items():
+        if own.stop - own.start == 6:
+            scale = np.abs(state.values[name][:3])
+            longest.append(float(np.max(np.abs(theta[own].reshape(2, 3)) / scale)) / LARGEST_RELATIVE)
+    return 1.0 / max(1.0, *longest)
+
+
+def _first_levels(model: Model, state: State, path: Trajectory, residual: Array) -> Levels:
+    known = np.repeat(np.column_stack([model.triads[name].known for name in model.rows]), 3, axis=1)
+    sigma = np.array([robust_sigma(r[k]) for r, k in zip(residual.T, known.T, strict=True)])
+    variance = np.maximum(sigma**2, LEAST_VARIANCE)
+    jumped = np.sum(path.jump**2) / (3.0 * np.sum(model.knots.interval_s * model.knots.joined))
+    walk = max(WALK_START * gyro_walk(model, state), float(jumped), LEAST_WALK)
+    return Levels(variance, np.ones(len(variance)), walk, ACCELERATION_START_MPS2)
+
+
+def gyro_walk(model: Model, state: State) -> float:
+    """Walk of the integrated attitude, rad²/s, that the gyroscope's sample-to-sample noise makes."""
+    noise = np.max(white_noise_sigma(model.triads["gyroscope"].x) * np.abs(state.values["gyroscope"][:3]))
+    return float(noise**2 * np.median(np.diff(model.readings.t)))
+
+
+def _levels(model: Model, residual: Array, levels: Levels, absorbed: Array, squares: Array, most_walk: float) -> Levels:
+    """Variance components: squares over what the unknowns leave of their number."""
+    weight = _robust_weight(model, residual, levels)
+    count = weight.sum(axis=0)
+    left = np.maximum(count - levels.colour * absorbed, 0.05 * count)
+    variance = np.maximum(np.sum(weight * residual**2, axis=0) / left, LEAST_VARIANCE)
+    square, number, taken = squares.T
+    ratio = np.clip(square / np.maximum(number - taken, 0.02 * number), 0.1, 10.0)
+    # On its way to nothing the translation creeps: more than the plain step there.
+    walk, strength = levels.walk * ratio[0], levels.strength * ratio[1] ** (0.8 if ratio[1] < 1.0 else 0.5)
+    return Levels(
+        variance,
+        _colour(model, residual, weight),
+        # A start that jumps is loose at first and stiffens by steps: the linear equations hold for small turns only.
+        float(np.clip(walk, LEAST_WALK, max(most_walk, levels.walk / STIFFENING, LEAST_WALK))),
+        max(float(strength), LEAST_ACCELERATION_MPS2),
+    )
+
+
+def _largest_change(before: Levels, after: Levels) -> float:
+    """Largest relative change of a noise variance."""
+    old, new = (np.r_[v.variance, v.walk, v.strength**2] for v in (before, after))
+    return float(np.max(np.abs(new / old - 1.0)))
+
+
+def _robust_weight(model: Model, residual: Array, levels: Levels) -> Array:
+    """Redescending weights (m, r): 1 up to CLIP standard deviations of the reading, (CLIP/d)² beyond, 0 for none."""
+    out = np.empty_like(residual)
+    for i, name in enumerate(model.rows):
+        row = slice(3 * i, 3 * i + 3)
+        square = np.sum(residual[:, row] ** 2 / levels.variance[row], axis=1)
+        weight = np.minimum(1.0, CLIP**2 / np.maximum(square, 1e-12)) * model.triads[name].known
+        out[:, row] = weight[:, None]
+    return out
+
+
+def _colour(model: Model, residual: Array, weight: Array) -> Array:
+    """Density at low frequency over the white one, (r,): from the autocorrelation within half an interval."""
+    lags = int(np.clip(len(residual) / len(model.knots.index) / 2, 1, 8))
+    x = residual * np.sqrt(weight)
+    zero = np.maximum(np.sum(x * x, axis=0), 1e-300)
+    colour = np.ones(x.shape[1])
+    for lag in range(1, lags + 1):
+        colour += 2.0 * (1.0 - lag / (lags + 1)) * np.sum(x[lag:] * x[:-lag], axis=0) / zero
+    return np.clip(np.repeat(colour.reshape(-1, 3).mean(axis=1), 3), 1.0, 10.0)
+
+
+def _logged_units(model: Model, state: State, path: Trajectory, walk: float) -> Array:
+    """Gradient (3,) on the gyroscope's λ' that makes its residual one in logged units.
+
+    A jump c of the attitude is gyroscope noise of c/λ logged units; as an angle it would shrink with λ, and with it the
+    rates (the attenuation of a noisy regressor). ∂/∂λ_i of −½Σ(c_i/λ_i)²/σ² is Σc_i²/(λ_i walk Δt)."""
+    knots = model.knots
+    jump = np.einsum("kij,kj->ki", body_from_inertial(state.q[:-1]), path.jump)
+    square = np.sum(jump**2 / (walk * knots.interval_s)[:, None], axis=0)
+    # Noise makes one each; more is misfit that the walk's bound keeps from being noise, and no reason to move.
+    return np.asarray(np.minimum(square, knots.joined.sum()) / state.values["gyroscope"][:3])
+
+
+def _integrated_translation(model: Model, state: State, reaction: tuple[Array, Array], response: Array) -> Array:
+    """Gradient (3,) on the accelerometer's λ' from integrating over the translation instead of maximising over it.
+
+    With V(λ) the logged readings' covariance, translation included, and H the attitudes' sensitivity, the score of a
+    likelihood maximised over the attitudes has the bias −½ tr[(HᵀV⁻¹H)⁻¹ HᵀV⁻¹ V_λ V⁻¹H]. Taken off, what is left
+    beside the quadratic form is tr_i/λ_i: the trace of row i's hat matrix that belongs to the translation."""
+    row = 3 * model.rows.index("accelerometer")
+    taken = np.einsum("kcr,kc->r", reaction[0][:, 3:, row : row + 3], response[:, SENSED[3:]])
+    return np.asarray(taken / state.values["accelerometer"][:3])

@@ -1,0 +1,242 @@
+"""The attitude and motion of a whole record as one chain of knots: its process noise and its banded normal equations.
+
+Multiple shooting with soft joints. Between neighbouring knots the gyroscope is integrated; where one interval ends and
+the next begins the attitude may jump by what gyroscope noise makes of the interval. Beside the attitude a knot carries
+the translation that the accelerometer senses: velocity, acceleration and jerk of a velocity that is white noise behind
+three equal low-passes, so that the acceleration has no constant part, as that of a vehicle that stays in sight. All
+knots are eliminated from the normal equations at once by a banded Cholesky factor (the Schur complement), in time
+linear in the record's length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import LinAlgError, expm, solve_continuous_lyapunov, solveh_banded
+
+from fieldcal.errors import EstimationError
+from fieldcal.rotation import Array
+
+# Where the acceleration has most power; a tenth of it is left at a quarter and at four times this frequency.
+MOTION_HZ = 0.7
+ORDER = 3  # velocity, acceleration, jerk, scaled to m/s²
+STATES = 3 + 3 * ORDER  # attitude error first
+WEAK = 1e-2  # 1/rad²: keeps directions that nothing observes (heading without a magnetometer) from being singular
+
+
+@dataclass(frozen=True)
+class Knots:
+    """Where the chain is tied: `index` (K,) sample of each knot; `of_sample` (n,) the knot at or before each sample;
+    `share` (n,) of the interval gone by there; `joined` (K−1,) whether neighbours belong to one contiguous segment;
+    `interval_s` (K−1,) between them (1 where not joined); `motion` the translation's process per interval."""
+
+    index: np.ndarray
+    of_sample: np.ndarray
+    share: Array
+    joined: np.ndarray
+    interval_s: Array
+    motion: Motion
+
+
+@dataclass(frozen=True)
+class Motion:
+    """y_{k+1} = F y_k + noise for y = (ω0 v, a, j/ω0) of an axis, stationary covariance P with P_aa = 1.
+
+    `whitener` (K−1, 3, 3) is L⁻¹ with LLᵀ = P − FPFᵀ; `carried` (K−1, 3, 3) is L⁻¹F; `settled` (3, 3) L⁻¹ with
+    LLᵀ = P."""
+
+    whitener: Array
+    carried: Array
+    settled: Array
+
+
+def place_knots(t: Array, segment: np.ndarray, spacing_s: float) -> Knots:
+    """Tie contiguous segments at equal parts of at most `spacing_s`, on samples, both ends included."""
+    n = len(t)
+    starts = np.flatnonzero(np.r_[True, segment[1:] != segment[:-1]])
+    index = []
+    for a, b in zip(starts, np.r_[starts[1:], n], strict=True):
+        parts = max(1, int(np.ceil((t[b - 1] - t[a]) / spacing_s)))
+        edges = np.searchsorted(t[a:b], np.linspace(t[a], t[b - 1], parts + 1)[1:-1]) + a
+        index.append(np.unique(np.r_[a, edges, b - 1]))
+    knot = np.concatenate(index)
+    joined = segment[knot[1:]] == segment[knot[:-1]]
+    interval = np.where(joined, t[knot[1:]] - t[knot[:-1]], 1.0)
+    of_sample = np.searchsorted(knot, np.arange(n), side="right") - 1
+    share = (t - t[knot[of_sample]]) / np.r_[interval, 1.0][of_sample]
+    return Knots(knot, of_sample, share, joined, interval, _motion(interval))
+
+
+def _motion(interval_s: Array) -> Motion:
+    # Neighbouring intervals differ by a sample at most: one process for each length in whole milliseconds.
+    lengths, which = np.unique(np.maximum(np.round(interval_s, 3), 1e-3), return_inverse=True)
+    # v‴ + 3ω0 v″ + 3ω0² v′ + ω0³ v = white: the acceleration's density peaks at ω0/√2.
+    omega = 2 * np.pi * MOTION_HZ * np.sqrt(2.0)
+    rate = omega * np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, -3.0, -3.0]])
+    stationary = solve_continuous_lyapunov(rate, -np.diag([0.0, 0.0, 1.0]))
+    stationary /= stationary[1, 1]
+    whitener, carried = np.empty((2, len(lengths), ORDER, ORDER))
+    for i, length in enumerate(lengths):
+        f = expm(rate * length)
+        whitener[i] = np.linalg.inv(np.linalg.cholesky(stationary - f @ stationary @ f.T))
+        carried[i] = whitener[i] @ f
+    return Motion(whitener[which], carried[which], np.linalg.inv(np.linalg.cholesky(stationary)))
+
+
+@dataclass
+class Normal:
+    """Normal equations of the chain, bordered by the parameters: N x = b for every column of `right`.
+
+    `diagonal` (K, s, s), `below` (K−1, s, s) couples knot k+1 (rows) to k; `right` (K, s, c): first p columns couple
+    the knots to the parameters, the others are right-hand sides; `parameters` (p, p), `parameters_right` (p, c − p)."""
+
+    diagonal: Array
+    below: Array
+    right: Array
+    parameters: Array
+    parameters_right: Array
+
+    @classmethod
+    def empty(cls, knots: int, parameters: int, rights: int) -> Normal:
+        return cls(
+            np.zeros((knots, STATES, STATES)),
+            np.zeros((knots - 1, STATES, STATES)),
+            np.zeros((knots, STATES, parameters + rights)),
+            np.zeros((parameters, parameters)),
+            np.zeros((parameters, rights)),
+        )
+
+    def eliminate(self) -> tuple[Array, Array, Array]:
+        """Knots eliminated by a banded Cholesky factor: N_xx⁻¹ right (K, s, c), information of θ (p, p) (the Schur
+        complement N_θθ − N_θx N_xx⁻¹ N_xθ), gradients (p, c − p). Raises EstimationError `joint_singular`."""
+        p = len(self.parameters)
+        eliminated = banded_solve(self.diagonal, self.below, self.right)
+        flat, solved = (x.reshape(-1, x.shape[2]) for x in (self.right, eliminated))
+        information = self.parameters - flat[:, :p].T @ solved[:, :p]
+        gradient = self.parameters_right - flat[:, :p].T @ solved[:, p:]
+        return eliminated, 0.5 * (information + information.T), gradient
+
+
+def banded_solve(diagonal: Array, below: Array, right: Array) -> Array:
+    """Solve the block tridiagonal system with blocks (K, m, m), (K−1, m, m) for right-hand sides (K, m, c)."""
+    k, m = diagonal.shape[:2]
+    band = np.zeros((2 * m, k * m))
+    for a in range(m):
+        for b in range(m):
+            if b <= a:
+                band[a - b, b::m] = diagonal[:, a, b]
+            band[m + a - b, b : (k - 1) * m : m] = below[:, a, b]
+    try:
+        solved = solveh_banded(band, right.reshape(k * m, -1), lower=True, overwrite_ab=True, check_finite=False)
+    except (LinAlgError, ValueError) as error:
+        raise EstimationError(
+            "joint_singular", "The joint equations are singular: the readings contradict the start."
+        ) from error
+    return np.asarray(solved.reshape(right.shape))
+
+
+def solve_scaled(information: Array, gradient: Array) -> Array:
+    """information⁻¹ gradient with columns scaled to one; directions without information do not move."""
+    scale = np.sqrt(np.maximum(np.diagonal(information), 1e-300))
+    solved = np.linalg.lstsq(information / np.outer(scale, scale), gradient / scale[:, None], rcond=1e-12)[0]
+    return np.asarray(solved / scale[:, None])
+
+
+@dataclass(frozen=True)
+class Joints:
+    """What ties neighbouring knots, linearised: `jump` (K−1, 3) rad, attitude of the next knot after the integrated
+    one, inertial axes; `moved` (K−1, 3, p) ∂(integrated attitude)/∂θ; `walk` gyroscope noise, rad²/s; `motion` (K, 9);
+    `strength` stationary rms of its acceleration, m/s² an axis."""
+
+    jump: Array
+    moved: Array
+    walk: float
+    motion: Array
+    strength: float
+
+
+def add_joints(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> None:
+    """Add attitude jumps and the translation's process to the normal equations."""
+    p = len(normal.parameters)
+    weight = knots.joined / (joints.walk * knots.interval_s)
+    eye = np.eye(3) * weight[:, None, None]
+    normal.diagonal[:-1, :3, :3] += eye
+    normal.diagonal[1:, :3, :3] += eye
+    normal.diagonal[:, range(3), range(3)] += WEAK
+    normal.below[:, :3, :3] -= eye
+    coupling = joints.moved * weight[:, None, None]
+    rights = np.stack([-joints.jump * weight[:, None], probe.jump * np.sqrt(weight)[:, None]], axis=2)
+    normal.right[1:, :3, :p] -= coupling
+    normal.right[:-1, :3, :p] += coupling
+    normal.right[1:, :3, p:] += rights
+    normal.right[:-1, :3, p:] -= rights
+    flat = joints.moved.reshape(-1, p)
+    normal.parameters += flat.T @ coupling.reshape(-1, p)
+    normal.parameters_right -= flat.T @ rights.reshape(-1, 2)
+    _add_motion(normal, knots, joints, probe)
+
+
+def _process(knots: Knots, strength: float) -> tuple[Array, Array, Array]:
+    """Whitened process: (K−1, 3, 3) on the next knot, (K−1, 3, 3) on this one, (K, 3, 3) on a segment's first."""
+    on = (knots.joined / strength)[:, None, None]
+    first = (np.r_[True, ~knots.joined] / strength)[:, None, None]
+    return knots.motion.whitener * on, knots.motion.carried * on, knots.motion.settled * first
+
+
+def _add_motion(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> None:
+    p = len(normal.parameters)
+    ahead, behind, first = _process(knots, joints.strength)
+    back, forth, begin = (x.transpose(0, 2, 1) for x in (behind, ahead, first))
+    for into, block in (
+        (normal.diagonal[1:], forth @ ahead),
+        (normal.diagonal[:-1], back @ behind),
+        (normal.below, -forth @ behind),
+        (normal.diagonal, begin @ first),
+    ):
+        for axis in range(3):
+            own = slice(3 + axis, STATES, 3)
+            into[:, own, own] += block
+    y = joints.motion.reshape(-1, ORDER, 3)
+    drawn = (probe.motion * knots.joined[:, None, None], probe.start)
+    for column, (step, start) in enumerate(((behind @ y[:-1] - ahead @ y[1:], -(first @ y)), drawn)):
+        right = begin @ start
+        right[1:] += forth @ step
+        right[:-1] -= back @ step
+        normal.right[:, 3:, p + column] += right.reshape(-1, 3 * ORDER)
+
+
+def joint_squares(knots: Knots, joints: Joints, state: Array, theta: Array, probe: Probe) -> Array:
+    """(2, 3): for attitude jumps and for the translation, the whitened squares, how many, and how many of those the
+    unknowns absorb: their response to the probe, `state` (K, s) and `theta` (p,), against the probe itself."""
+    root = np.sqrt(knots.joined / (joints.walk * knots.interval_s))[:, None]
+    response = root * (state[1:, :3] - state[:-1, :3] - joints.moved @ theta)
+    ahead, behind, first = _process(knots, joints.strength)
+    y, dy = (x.reshape(-1, ORDER, 3) for x in (joints.motion, state[:, 3:]))
+    moved = probe.motion * (ahead @ dy[1:] - behind @ dy[:-1])
+    square = np.sum((ahead @ y[1:] - behind @ y[:-1]) ** 2) + np.sum((first @ y) ** 2)
+    joined, segments = int(knots.joined.sum()), 1 + int(np.sum(~knots.joined))
+    return np.array(
+        [
+            [np.sum((root * joints.jump) ** 2), 3 * joined, np.sum(probe.jump * response)],
+            [square, 3 * ORDER * (joined + segments), np.sum(moved) + np.sum(probe.start * (first @ dy))],
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Fixed random signs, one for each residual: pushed through the fit they measure how much of each group of
+    residuals the unknowns absorb (Monte-Carlo variance components: García-Cortés et al. 1992, Kusche 2003)."""
+
+    sensors: Array  # (n, rows)
+    jump: Array  # (K−1, 3)
+    motion: Array  # (K−1, 3, 3)
+    start: Array  # (K, 3, 3)
+
+    @classmethod
+    def draw(cls, samples: int, rows: int, knots: int) -> Probe:
+        rng = np.random.default_rng(0)
+        shapes = ((samples, rows), (knots - 1, 3), (knots - 1, ORDER, 3), (knots, ORDER, 3))
+        signs = [rng.integers(0, 2, shape) * 2.0 - 1.0 for shape in shapes]
+        return cls(*signs)

@@ -1,0 +1,97 @@
+"""Standard deviations one can fly on: the joint covariance with coloured residuals, and what would make it smaller."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from fieldcal.joint_model import SENSED, Model, Rows, State, sums_by_interval
+from fieldcal.rotation import Array
+from fieldcal.statistics import coloured_information
+
+
+def covariance(
+    model: Model,
+    chunks: Iterator[tuple[slice, Rows, Array]],
+    response: Array,
+    information: Array,
+    whitening: Array,
+) -> Array:
+    """Covariance (p, p) of θ: the inverse information, enlarged where the sensors' residuals are coloured.
+
+    Noise correlated within an interval is in the whitening already. What is correlated over longer times (a field that
+    varies from place to place, a temperature) is judged from means by interval: M = ΣΣ S̄ᵀ𝓡S̄ instead of ΣS̄ᵀS̄ for each
+    sensor row, S̄ the sensitivity with the knots eliminated. No standard deviation is ever made smaller by it.
+
+    Parameters
+    ----------
+    chunks
+        `joint_model.sensitivities` at the solution.
+    response : (K, s, p) array
+        Knots' response N_xx⁻¹N_xθ to the parameters.
+    information : (p, p) array
+        Of θ, knots eliminated.
+    whitening : (m, r) array
+        Weights over low-frequency variance.
+    """
+    inverse = inverse_information(information)
+    k, r, p = len(response), whitening.shape[1], len(information)
+    sensitivity, residual, count = np.zeros((k, r, p)), np.zeros((k, r)), np.zeros((k, r))
+    for ties, rows, _ in chunks:
+        at = model.at[rows.own]
+        knot, share = model.knots.of_sample[at], model.knots.share[at, None, None]
+        after = np.minimum(knot + 1, k - 1)
+        between = (1.0 - share) * response[knot][:, SENSED] + share * response[after][:, SENSED]
+        root = np.sqrt(whitening[rows.own])
+        left = (rows.by_parameter - rows.by_knot @ between) * root[..., None]
+        sensitivity[ties] = sums_by_interval(model, left.reshape(len(at), -1), rows.own, ties).reshape(-1, r, p)
+        residual[ties] = sums_by_interval(model, rows.residual * root, rows.own, ties)
+        count[ties] = sums_by_interval(model, (root > 0).astype(float), rows.own, ties)
+    scale = 1.0 / np.sqrt(np.maximum(count, 1.0))
+    sensitivity, residual = sensitivity * scale[..., None], residual * scale
+    excess = np.zeros((p, p))
+    for row in range(r):
+        s, e = sensitivity[:, row], residual[:, row]
+        variance = float(np.mean(e**2))
+        if variance > 0.0:
+            excess += coloured_information(s[:, None, :], e[:, None]) / variance - s.T @ s
+    coloured = np.diagonal(inverse @ excess @ inverse)
+    plain = np.diagonal(inverse)
+    enlarged = np.sqrt(np.maximum(1.0, 1.0 + coloured / plain))
+    return np.asarray(inverse * np.outer(enlarged, enlarged))
+
+
+def inverse_information(information: Array) -> Array:
+    """Inverse (p, p) of an information matrix scaled to unit diagonal; positive by the prior in it."""
+    scale = 1.0 / np.sqrt(np.diagonal(information))
+    return np.asarray(np.linalg.pinv(information * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale))
+
+
+# Motion that shows a triad's constants: what to add when an axis stays uncertain.
+TURNS = {"x": "pitch", "y": "roll", "z": "roll and pitch"}
+WEAK_RELATIVE_SD = 0.01
+
+
+def advice(model: Model, state: State, layout: Mapping[str, slice], covariance: Array) -> str:
+    """Which scales are weak and which motion would help, in a sentence; empty where all are within 1 %.
+
+    A vector triad's axis is seen when the sensed vector swings along it; a gyroscope's when the vehicle turns about
+    it."""
+    weak = []
+    for name, own in layout.items():
+        if name not in model.triads:
+            continue
+        variance = np.diagonal(covariance)[own.start : own.start + 3]
+        relative = np.sqrt(variance) / np.abs(state.values[name][:3])
+        weak += [(float(sd), name, i) for i, sd in enumerate(relative) if sd > WEAK_RELATIVE_SD]
+    if not weak:
+        return ""
+    sd, name, axis = max(weak)
+    letter = "xyz"[axis]
+    if name == "gyroscope":
+        help_with = f"turn about {letter} by 60° either way, several times"
+    else:
+        vector = "gravity" if name == "accelerometer" else "the magnetic field"
+        help_with = f"tilt until {vector} lies along +{letter} and along −{letter}: 60° of {TURNS[letter]} either way"
+    return f"The {name}'s {letter} scale is the weakest (sd {100 * sd:.1f} %); to improve it, {help_with}."

@@ -1,0 +1,374 @@
+"""What the joint estimator expects of the sensors: residuals in logged units and their sensitivities, interval by
+interval (see `joint` for the whole)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fieldcal.gyro_equation import from_centred
+from fieldcal.joint_chain import Knots, Normal, Probe
+from fieldcal.rotation import (
+    Array,
+    body_from_inertial,
+    conjugate,
+    cumulative_product,
+    from_rotation_vector,
+    multiply,
+    rotation_steps,
+    skew,
+    to_rotation_vector,
+)
+
+CHUNK_ROWS = 8192
+MAX_TURN_RAD, MAX_AVERAGE_S = 0.1, 0.02
+ACCELERATION = slice(3, 6)  # of a knot's translation
+SENSED = np.array([0, 1, 2, 6, 7, 8])  # of a knot's states: attitude and acceleration
+TRIADS = ("gyroscope", "accelerometer", "magnetometer")
+
+
+@dataclass(frozen=True)
+class Readings:
+    """One record, every triad in the same sensor axes, logged units.
+
+    `t` (n,) s; `segment` (n,) contiguous stretches; `gyroscope` (n, 3) complete; `accelerometer`, `magnetometer` (n, 3)
+    with NaN where there is no reading, or None; `gravity_mps2` signed: negative for a specific-force accelerometer;
+    `field_ned` (3,) the configured local field; `turning` (2, n, 3) the gyroscope low-passed and its derivative, logged
+    units (for the lever arm)."""
+
+    t: Array
+    segment: np.ndarray
+    gyroscope: Array
+    accelerometer: Array | None
+    magnetometer: Array | None
+    gravity_mps2: float
+    field_ned: Array
+    turning: Array
+
+
+def stretches(segment: np.ndarray) -> list[tuple[int, int]]:
+    """Bounds [a, b) of the contiguous segments."""
+    starts = np.flatnonzero(np.r_[True, segment[1:] != segment[:-1]])
+    return list(zip(starts.tolist(), [*starts[1:].tolist(), len(segment)], strict=True))
+
+
+def averaging_side(readings: Readings, rate_radps: float) -> int:
+    """How many neighbours on either side a vector reading may be averaged with: while the vehicle turns by less than
+    MAX_TURN_RAD at `rate_radps` and both triads are complete."""
+    for x in (readings.accelerometer, readings.magnetometer):
+        if x is not None and not np.isfinite(x).all():
+            return 0
+    interval = float(np.median(np.diff(readings.t)))
+    longest = min(MAX_TURN_RAD / max(rate_radps, 1e-9), MAX_AVERAGE_S)
+    return max(0, int((longest / interval - 1.0) / 2.0))
+
+
+@dataclass(frozen=True)
+class Centred:
+    """A triad's readings as x = (logged − centre)/spread, so that its constants (λ', b') are of order one."""
+
+    x: Array
+    known: np.ndarray
+    centre: Array
+    spread: Array
+
+    @classmethod
+    def of(cls, logged: Array) -> Centred:
+        known = np.asarray(np.isfinite(logged).all(axis=1))
+        centre = logged[known].mean(axis=0)
+        spread = np.maximum(logged[known].std(axis=0), 1e-300)
+        return cls(np.where(known[:, None], (logged - centre) / spread, 0.0), known, centre, spread)
+
+    def averaged(self, at: np.ndarray, side: int) -> Centred:
+        """At samples `at` only, each the mean of itself and `side` neighbours on either side."""
+        x = sum(self.x[at + k] for k in range(-side, side + 1)) / (2 * side + 1)
+        return replace(self, x=np.asarray(x), known=self.known[at])
+
+    def scaled(self, scale: Array, bias: Array) -> Array:
+        """(λ', b') (6,) of constants in logged units."""
+        return np.concatenate([scale * self.spread, bias + scale * self.centre])
+
+    def to_logged(self) -> Array:
+        """(λ, b) = T (λ', b'), (6, 6)."""
+        return from_centred(self.centre, self.spread)
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything unknown: knot attitudes `q` (K, 4) of the sensor axes, `motion` (K, 9), and `values` by name: each
+    triad's (λ', b') (6,), `dip` (1,) rad, `lever_arm` (3,) m, sensor axes."""
+
+    q: Array
+    motion: Array
+    values: Mapping[str, Array]
+
+    def moved(self, knots: Array, theta: Array, layout: Mapping[str, slice]) -> State:
+        """After a step: knots (K, s), parameters (p,)."""
+        values = dict(self.values)
+        for name, own in layout.items():
+            values[name] = values[name] + theta[own]
+        return State(
+            multiply(from_rotation_vector(knots[:, :3]), self.q), self.motion + knots[:, 3:], values
+        )
+
+
+@dataclass(frozen=True)
+class Model:
+    """The record prepared for fitting. `rows` names the vector triads present, three residual rows each; they are
+    compared at samples `at` (m,), each triad's readings there in `triads` (the gyroscope's at every sample)."""
+
+    readings: Readings
+    triads: Mapping[str, Centred]
+    knots: Knots
+    rows: tuple[str, ...]
+    at: np.ndarray
+
+    @classmethod
+    def of(cls, readings: Readings, knots: Knots, *, side: int = 0) -> Model:
+        """`side`: vector readings are averaged over that many neighbours on either side (see `averaging_side`)."""
+        given = {name: getattr(readings, name) for name in TRIADS}
+        triads = {name: Centred.of(x) for name, x in given.items() if x is not None and np.isfinite(x).any()}
+        rows = tuple(name for name in TRIADS[1:] if name in triads)
+        at = np.concatenate(
+            [np.arange(a + side, b - side, 2 * side + 1) for a, b in stretches(readings.segment) if b - a > 2 * side]
+        )
+        triads = {name: x.averaged(at, side) if name in rows else x for name, x in triads.items()}
+        return cls(readings, triads, knots, rows, at)
+
+    def field(self, dip: float) -> tuple[Array, Array]:
+        """Local field (3,), NED, at a dip angle, rad, and its derivative."""
+        north, east, _ = self.readings.field_ned
+        strength, heading = np.linalg.norm(self.readings.field_ned), np.arctan2(east, north)
+        level = np.array([np.cos(heading), np.sin(heading), 0.0])
+        down = np.array([0.0, 0.0, 1.0])
+        return (
+            strength * (np.cos(dip) * level + np.sin(dip) * down),
+            strength * (-np.sin(dip) * level + np.cos(dip) * down),
+        )
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The record under a state: attitude `q` (n, 4) of the sensor axes and `rate` (n, 3), rad/s, as the gyroscope says;
+    `jump` (K−1, 3) at the joints, rad, inertial axes, already spread over the intervals in q."""
+
+    q: Array
+    rate: Array
+    jump: Array
+
+
+def trajectory(model: Model, state: State) -> Trajectory:
+    """Integrate the gyroscope from every knot and spread the jump to the next one evenly over the interval."""
+    knots, t = model.knots, model.readings.t
+    gyro = state.values["gyroscope"]
+    rate = gyro[:3] * model.triads["gyroscope"].x + gyro[3:]
+    steps = from_rotation_vector(rotation_steps(t, rate))
+    broken = model.readings.segment[1:] != model.readings.segment[:-1]
+    steps[broken] = 0.0, 0.0, 0.0, 1.0
+    total = cumulative_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], steps]))
+    at_knots = total[knots.index]
+    start = multiply(state.q, conjugate(at_knots))
+    jump = to_rotation_vector(multiply(state.q[1:], conjugate(multiply(start[:-1], at_knots[1:]))))
+    jump[~knots.joined] = 0.0
+    spread = knots.share[:, None] * np.r_[jump, np.zeros((1, 3))][knots.of_sample]
+    return Trajectory(multiply(from_rotation_vector(spread), multiply(start[knots.of_sample], total)), rate, jump)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Residuals of samples `own` and what moves them, in units of x: `residual` (m, r), `by_knot` (m, r, 6) for
+    attitude (3) and acceleration (3), `by_parameter` (m, r, p)."""
+
+    own: slice
+    residual: Array
+    by_knot: Array
+    by_parameter: Array
+
+
+def lever_arm_geometry(model: Model, state: State, own: slice) -> Array:
+    """Acceleration of the sensor about the centre of mass per metre of lever arm, (m, 3, 3): S(ω̇) + S(ω)²."""
+    scaled = state.values["gyroscope"]
+    gyro = model.triads["gyroscope"]
+    scale = scaled[:3] / gyro.spread
+    rate, change = model.readings.turning[:, model.at[own]]
+    turn = skew(scale * (rate - gyro.centre) + scaled[3:])
+    return np.asarray(skew(scale * change) + turn @ turn)
+
+
+def residuals(model: Model, state: State, path: Trajectory) -> Array:
+    """Logged minus predicted, (m, r), units of x; 0 where there is no reading."""
+    out = np.empty((len(model.at), 3 * len(model.rows)))
+    for own, _ in chunks(model):
+        turn = body_from_inertial(path.q[model.at[own]])
+        for i, name in enumerate(model.rows):
+            out[own, 3 * i : 3 * i + 3] = _residual(model, state, own, name, _sensed(model, state, own, turn, name)[0])
+    return out
+
+
+def _sensed(model: Model, state: State, own: slice, turn: Array, name: str) -> tuple[Array, Array]:
+    """What a triad should sense, SI, sensor axes (m, 3), and the inertial vector (m, 3) or (3,) behind it."""
+    if name == "magnetometer":
+        vector = model.field(float(state.values["dip"][0]))[0]
+        return turn @ vector, vector
+    sign, g = np.sign(model.readings.gravity_mps2), abs(model.readings.gravity_mps2)
+    knots = model.knots
+    k, share = knots.of_sample[model.at[own]], knots.share[model.at[own], None]
+    a = state.motion[:, ACCELERATION]
+    after = np.minimum(k + 1, len(a) - 1)
+    vector = sign * (np.array([0.0, 0.0, g]) - (1.0 - share) * a[k] - share * a[after])
+    sensed = np.einsum("nij,nj->ni", turn, vector)
+    arm = state.values["lever_arm"]
+    if arm.any():
+        sensed = sensed - sign * (lever_arm_geometry(model, state, own) @ arm)
+    return sensed, vector
+
+
+def _residual(model: Model, state: State, own: slice, name: str, sensed: Array) -> Array:
+    triad, constants = model.triads[name], state.values[name]
+    return np.where(triad.known[own, None], triad.x[own] - (sensed - constants[3:]) / constants[:3], 0.0)
+
+
+def chunks(model: Model) -> Iterator[tuple[slice, slice]]:
+    """Rows and knots in runs of whole intervals, so that sensitivities of an hour fit in memory."""
+    starts = np.searchsorted(model.at, model.knots.index)  # first row of every interval
+    first = 0
+    while first < len(starts):
+        last = max(int(np.searchsorted(starts, starts[first] + CHUNK_ROWS)), first + 1)
+        end = len(model.at) if last >= len(starts) else int(starts[last])
+        yield slice(int(starts[first]), end), slice(first, min(last, len(starts)))
+        first = last
+
+
+def sensitivities(
+    model: Model, state: State, path: Trajectory, layout: Mapping[str, slice], parameters: int
+) -> Iterator[tuple[slice, Rows, Array]]:
+    """Chunk by chunk: its knots, its rows, and ∂(attitude at the interval's end)/∂θ (knots, 3, p)."""
+    for own, ties in chunks(model):
+        turn = body_from_inertial(path.q[model.at[own]])
+        moved, ends = _turned_by_gyroscope(model, path, own, ties)
+        m, r = own.stop - own.start, 3 * len(model.rows)
+        residual, by_knot, by_parameter = np.empty((m, r)), np.zeros((m, r, 6)), np.zeros((m, r, parameters))
+        for i, name in enumerate(model.rows):
+            row = slice(3 * i, 3 * i + 3)
+            constants, known = state.values[name], model.triads[name].known[own].astype(float)
+            sensed, vector = _sensed(model, state, own, turn, name)
+            residual[:, row] = _residual(model, state, own, name, sensed)
+            gain = known[:, None, None] / constants[:3, None]
+            by_knot[:, row, :3] = gain * (turn @ skew(vector))
+            by_parameter[:, row, layout["gyroscope"]] = by_knot[:, row, :3] @ moved
+            column = layout[name].start
+            for axis in range(3):
+                scaled = (sensed[:, axis] - constants[3 + axis]) / constants[axis]
+                by_parameter[:, 3 * i + axis, column + axis] = -known * scaled / constants[axis]
+                by_parameter[:, 3 * i + axis, column + 3 + axis] = -known / constants[axis]
+            if name == "magnetometer" and "dip" in layout:
+                turned = model.field(float(state.values["dip"][0]))[1]
+                by_parameter[:, row, layout["dip"]] = gain * (turn @ turned)[..., None]
+            if name == "accelerometer":
+                sign = np.sign(model.readings.gravity_mps2)
+                by_knot[:, row, 3:] = -sign * gain * turn
+                if "lever_arm" in layout:
+                    by_parameter[:, row, layout["lever_arm"]] = -sign * gain * lever_arm_geometry(model, state, own)
+        end = np.zeros((ties.stop - ties.start, 3, parameters))
+        end[:, :, layout["gyroscope"]] = ends
+        yield ties, Rows(own, residual, by_knot, by_parameter), end
+
+
+def _turned_by_gyroscope(model: Model, path: Trajectory, own: slice, ties: slice) -> tuple[Array, Array]:
+    """∂(attitude error)/∂(λ', b') of the gyroscope at rows (m, 3, 6), the jump's share taken off, and at the ends of
+    the chunk's intervals (knots, 3, 6): ∫ R_nb [diag x, I] dτ from the knot before, trapezoidal."""
+    knots, t = model.knots, model.readings.t
+    first = int(knots.index[ties.start])
+    last = int(knots.index[min(ties.stop, len(knots.index) - 1)])  # the last interval ends at the next chunk's knot
+    reach = slice(first, last + 1)
+    x = model.triads["gyroscope"].x[reach]
+    r_nb = body_from_inertial(path.q[reach]).transpose(0, 2, 1)
+    integrand = np.concatenate([r_nb * x[:, None, :], r_nb], axis=2).reshape(len(x), 18)
+    total = np.zeros_like(integrand)
+    np.cumsum(0.5 * np.diff(t[reach])[:, None] * (integrand[1:] + integrand[:-1]), axis=0, out=total[1:])
+    total = total.reshape(-1, 3, 6)
+    at_knots = total[knots.index[ties] - first]
+    following = np.r_[knots.index[ties][1:] - first, len(x) - 1]
+    ends = total[following] - at_knots
+    ends[~np.r_[knots.joined, False][ties]] = 0.0
+    at = model.at[own]
+    k = knots.of_sample[at] - ties.start
+    return total[at - first] - at_knots[k] - knots.share[at, None, None] * ends[k], ends
+
+
+def accumulate(
+    normal: Normal, model: Model, rows: Rows, ties: slice, weight: Array, probe: Probe, groups: tuple[Array, Array]
+) -> None:
+    """Add a chunk's rows, whitened by `weight` (m, r) = 1/σ² with robust weights in, to the normal equations.
+
+    `groups` ((K, 6, r), (p, r)) collect each row's own reaction to the probe."""
+    p = len(normal.parameters)
+    root = np.sqrt(weight)
+    h, g = rows.by_knot * root[..., None], rows.by_parameter * root[..., None]
+    signs = probe.sensors[rows.own] * (root > 0)
+    share = model.knots.share[model.at[rows.own], None, None]
+    m, r = signs.shape
+    met = np.zeros((m + 1, r, 12 + p + 1 + r))  # one row of nothing, to fill shorter intervals with
+    met[:m, :, :6], met[:m, :, 6:12] = (1.0 - share) * h, share * h  # knot before, knot after
+    met[:m, :, 12 : 12 + p], met[:m, :, 12 + p] = g, rows.residual * root
+    met[:m, range(r), range(13 + p, 13 + p + r)] = signs
+    met = np.take(met, _padded(model, rows.own, ties), axis=0).reshape(ties.stop - ties.start, -1, met.shape[2])
+    product = met[..., :12].transpose(0, 2, 1) @ met  # (knots, 12, 12 + p + 1 + r)
+    here = np.arange(ties.start, ties.stop)
+    inside = here + 1 < len(normal.diagonal)
+    following = here[inside] + 1
+    pair = (slice(None), SENSED[:, None], SENSED[None, :])
+    for into, knot, part in (
+        (normal.diagonal, here, product[:, :6, :6]),
+        (normal.diagonal, following, product[inside, 6:, 6:12]),
+        (normal.below, here[inside], product[inside, 6:, :6]),
+    ):
+        block = into[knot]
+        block[pair] += part
+        into[knot] = block
+    for knot, part in ((here, product[:, :6, 12:]), (following, product[inside, 6:, 12:])):
+        right = normal.right[knot]
+        right[:, SENSED, : p + 1] += part[..., : p + 1]
+        right[:, SENSED, p + 1] += part[..., p + 1 :].sum(axis=2)
+        normal.right[knot] = right
+        groups[0][knot] += part[..., p + 1 :]
+    flat = g.reshape(-1, p)
+    normal.parameters += flat.T @ flat
+    normal.parameters_right[:, 0] += flat.T @ (rows.residual * root).reshape(-1)
+    own_reaction = np.einsum("nrp,nr->pr", g, signs)
+    normal.parameters_right[:, 1] += own_reaction.sum(axis=1)
+    groups[1][:] += own_reaction
+
+
+def _padded(model: Model, own: slice, ties: slice) -> np.ndarray:
+    """Rows of each of a chunk's intervals (knots, most rows); one past the last row where there are fewer."""
+    starts = np.searchsorted(model.at[own], model.knots.index[ties])
+    counts = np.diff(np.r_[starts, own.stop - own.start])
+    step = np.arange(max(int(counts.max()), 1))
+    return np.where(step < counts[:, None], starts[:, None] + step, own.stop - own.start)
+
+
+def sums_by_interval(model: Model, x: Array, own: slice, ties: slice) -> Array:
+    """Sums of the rows x (m, c) of a chunk over each of its intervals, (knots, c)."""
+    starts = np.searchsorted(model.at[own], model.knots.index[ties])
+    empty = np.diff(np.r_[starts, len(x)]) == 0
+    sums = np.add.reduceat(x, np.minimum(starts, len(x) - 1), axis=0)
+    sums[empty] = 0.0
+    return np.asarray(sums)
+
+
+def layout_of(model: Model, *, dip: bool, lever_arm: bool) -> tuple[dict[str, slice], int]:
+    """Where each free parameter stands in θ, and how many there are."""
+    layout, at = {}, 0
+    free = ["gyroscope", *model.rows]
+    if dip and len(model.rows) == 2:
+        free.append("dip")
+    if lever_arm and "accelerometer" in model.rows:
+        free.append("lever_arm")
+    for name in free:
+        size = {"dip": 1, "lever_arm": 3}.get(name, 6)
+        layout[name] = slice(at, at + size)
+        at += size
+    return layout, at

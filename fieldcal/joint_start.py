@@ -1,0 +1,172 @@
+"""Where the joint estimator starts: constants from whatever is known, attitudes from the vectors they give."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from fieldcal import attitude as wahba
+from fieldcal.ellipsoid import fit_ellipsoid
+from fieldcal.errors import EstimationError, UnusableFlight
+from fieldcal.gyro_equation import fit_equation_error
+from fieldcal.gyro_output import propagate_stretches
+from fieldcal.joint_chain import STATES, place_knots
+from fieldcal.joint_model import Model, Readings, State, averaging_side, stretches
+from fieldcal.rotation import (
+    Array,
+    body_from_inertial,
+    conjugate,
+    continuous,
+    from_rotation_vector,
+    multiply,
+    normalise,
+)
+from fieldcal.smoothing import differentiate_samples, smooth_samples
+
+SPACING_S = 0.08
+START_CUTOFF_HZ = 4.0
+FOLLOW_HZ, FOLLOW_SIDE_S = 0.2, 1.5
+TRUST = np.array([0.1, 0.03])  # relative length of field and gravity off by this: half the weight
+# Rates for the lever arm: their derivative's noise would shrink it (a regressor), so no more than the motion needs.
+LEVER_ARM_CUTOFF_HZ, LEVER_ARM_SIDE_S = 1.5, 1.0
+
+Constants = tuple[Array, Array]
+
+
+def low_passed(t: Array, segment: np.ndarray, x: Array, cutoff_hz: float, side_s: float) -> Array:
+    """Fixed-weight low-pass by contiguous segment."""
+    out = np.empty_like(x)
+    for a, b in stretches(segment):
+        out[a:b] = smooth_samples(t[a:b], x[a:b], cutoff_hz, side_s=side_s)
+    return out
+
+
+def turning(t: Array, segment: np.ndarray, gyroscope: Array) -> Array:
+    """Low-passed gyroscope and its derivative (2, n, 3), logged units: `Readings.turning`."""
+    low = low_passed(t, segment, gyroscope, LEVER_ARM_CUTOFF_HZ, LEVER_ARM_SIDE_S)
+    change = np.empty_like(low)
+    for a, b in stretches(segment):
+        change[a:b] = differentiate_samples(t[a:b], low[a:b], window_s=0.05)
+    return np.stack([low, change])
+
+
+def start_of_triad(logged: Array, magnitude: float, polarity: Array) -> Constants | None:
+    """Ellipsoid constants good enough to start from: the refined fit, else an algebraic one."""
+    known = logged[np.isfinite(logged).all(axis=1)]
+    for method in ("robust", "li", "two_step", "tls"):
+        try:
+            fit = fit_ellipsoid(known, magnitude, method=method, polarity=polarity)
+        except (UnusableFlight, EstimationError, ValueError):
+            continue
+        return fit.scale_diagonal, fit.bias
+    return None
+
+
+def prepare(
+    readings: Readings, constants: Mapping[str, Constants | None], *, lever_arm: Array | None = None
+) -> tuple[Model, State]:
+    """Model and start of a record.
+
+    Parameters
+    ----------
+    readings : Readings
+    constants : sensor → (λ (3,), b (3,)) or None
+        Starts in logged units, sensor axes, polarity right. A vector triad without one is left out; the gyroscope's is
+        estimated from attitudes where both vectors have one.
+    lever_arm : (3,) array, optional
+        Known, m, sensor axes.
+
+    Raises
+    ------
+    UnusableFlight
+        `no_start`: no vector triad has a start, or the gyroscope has none and one vector alone cannot give it.
+    """
+    vectors = {name: constants.get(name) for name in ("accelerometer", "magnetometer")}
+    readings = Readings(**{**vars(readings), **{name: None for name, own in vectors.items() if own is None}})
+    q, gyro = _start_attitude(readings, vectors, constants.get("gyroscope"))
+    knots = place_knots(readings.t, readings.segment, SPACING_S)
+    rate = np.sqrt(np.mean(np.sum((gyro[0] * readings.turning[0] + gyro[1]) ** 2, axis=1)))
+    model = Model.of(readings, knots, side=averaging_side(readings, 3.0 * float(rate)))
+    values = {"dip": np.array([_dip(readings.field_ned)]), "lever_arm": np.zeros(3) if lever_arm is None else lever_arm}
+    for name, own in {**vectors, "gyroscope": gyro}.items():
+        if name in model.triads and own is not None:
+            values[name] = model.triads[name].scaled(*own)
+    return model, State(q[knots.index], np.zeros((len(knots.index), STATES - 3)), values)
+
+
+def _dip(field_ned: Array) -> float:
+    return float(np.arctan2(field_ned[2], np.hypot(field_ned[0], field_ned[1])))
+
+
+def _start_attitude(
+    r: Readings, vectors: Mapping[str, Constants | None], gyro: Constants | None
+) -> tuple[Array, Constants]:
+    """Attitude of the sensor axes (n, 4) and gyroscope constants."""
+    sensed = {}
+    for name, own in vectors.items():
+        logged = r.accelerometer if name == "accelerometer" else r.magnetometer
+        if own is not None and logged is not None:
+            complete = _filled(r.t, logged)
+            sensed[name] = low_passed(r.t, r.segment, complete, START_CUTOFF_HZ, 0.5) * own[0] + own[1]
+    down = np.array([0.0, 0.0, float(np.sign(r.gravity_mps2))])
+    if len(sensed) == 2:
+        both = np.stack([sensed["magnetometer"], sensed["accelerometer"]], axis=1)
+        heading = float(np.arctan2(r.field_ned[1], r.field_ned[0]))
+        reference = np.array([r.field_ned, down])
+        q = continuous(wahba.attitudes(both, reference, np.array([0.02, 0.02]), declination=heading).q)
+        gyro = gyro if gyro is not None else _gyro_from_attitude(r, q)
+        lengths = np.linalg.norm(both, axis=2) / [np.linalg.norm(r.field_ned), abs(r.gravity_mps2)] - 1.0
+        trust = 1.0 / (1.0 + np.sum((lengths / TRUST) ** 2, axis=1))
+        return _carried_by_gyroscope(r, q, gyro, trust), gyro
+    if not sensed or gyro is None:
+        raise UnusableFlight(
+            "no_start",
+            "The joint estimate found no start: it needs a magnetometer or accelerometer with some constants, and with"
+            " one of them alone a gyroscope whose unit is known.",
+        )
+    ((name, vector),) = sensed.items()
+    relative = propagate_stretches(r.t, r.gyroscope * gyro[0] + gyro[1], r.segment)
+    return _levelled(relative, vector, r.field_ned if name == "magnetometer" else down), gyro
+
+
+def _carried_by_gyroscope(r: Readings, q: Array, gyro: Constants, trust: Array) -> Array:
+    """Attitudes that turn as the gyroscope says and follow `q` (n, 4), weighted by `trust` (n,), over seconds: sudden
+    errors of the vectors stay out."""
+    relative = propagate_stretches(r.t, r.gyroscope * gyro[0] + gyro[1], r.segment)
+    offset = multiply(q, conjugate(relative))
+    for a, b in stretches(r.segment):
+        offset[a:b] = continuous(offset[a:b])
+    weighted = low_passed(r.t, r.segment, offset * trust[:, None], FOLLOW_HZ, FOLLOW_SIDE_S)
+    return multiply(normalise(weighted), relative)
+
+
+def _levelled(relative: Array, vector: Array, reference: Array) -> Array:
+    """Integrated attitudes turned, sample by sample and the shortest way, so that `vector` (n, 3) lies along the
+    inertial `reference` (3,)."""
+    inertial = np.einsum("nji,nj->ni", body_from_inertial(relative), vector)
+    inertial /= np.linalg.norm(inertial, axis=1, keepdims=True)
+    unit = reference / np.linalg.norm(reference)
+    axis = np.cross(inertial, unit)
+    sine = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, inertial @ unit)
+    return multiply(from_rotation_vector(axis * (angle / np.maximum(sine, 1e-12))[:, None]), relative)
+
+
+def _filled(t: Array, x: Array) -> Array:
+    """Readings at every sample, linear between those there are."""
+    known = np.isfinite(x).all(axis=1)
+    return x if known.all() else np.column_stack([np.interp(t, t[known], c[known]) for c in x.T])
+
+
+def _gyro_from_attitude(r: Readings, q: Array) -> Constants:
+    """Equation error on the start's attitudes, both sides low-passed alike."""
+    logged = low_passed(r.t, r.segment, r.gyroscope, START_CUTOFF_HZ, 0.5)
+    q_dot = np.empty_like(q)
+    for a, b in stretches(r.segment):
+        q_dot[a:b] = differentiate_samples(r.t[a:b], q[a:b], window_s=0.05)
+    try:
+        fit = fit_equation_error(q, q_dot, logged)
+    except UnusableFlight as error:
+        raise UnusableFlight("no_start", f"The joint estimate found no start for the gyroscope: {error}") from error
+    return fit.scale, fit.bias

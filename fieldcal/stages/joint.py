@@ -1,0 +1,270 @@
+"""The joint estimate of all triads and the attitude (method `joint`): start, fit, judge, validate, write."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal import joint_start, sensor
+from fieldcal.errors import EstimationError, UnusableFlight
+from fieldcal.frames import (
+    AXES,
+    QUATERNION,
+    calibration_rows,
+    columns_of,
+    constants,
+    covariance_table,
+    matrix,
+    seconds,
+    triad,
+)
+from fieldcal.joint import JointFit, fit_joint
+from fieldcal.joint_covariance import advice
+from fieldcal.joint_model import Readings
+from fieldcal.results import StageResult, fatal_fault, triad_rows
+from fieldcal.rotation import Array, from_matrix, multiply
+from fieldcal.stages.attitude import logged_constants
+from fieldcal.stages.inputs import Settings, Tables, mean_temperature, reference_reading, refusal
+
+METHOD = "joint"
+SENSORS = ("magnetometer", "accelerometer", "gyroscope")
+SERIAL_METHODS: dict[str, tuple[str | None, ...]] = {
+    "magnetometer": (None,),
+    "accelerometer": (None,),
+    "gyroscope": ("output_error", "equation_error"),
+}
+UNITS = {"magnetometer": "", "accelerometer": "m/s^2", "gyroscope": "rad/s"}
+# A magnetometer's readings count as one each only where they are about as many as the gyroscope's.
+SPARSE = 0.9
+HELD_IN_SHARE = 0.7
+MAX_GYRO_NOISE_SHARE = 0.5
+
+
+def estimate_jointly(tables: Tables, s: Settings) -> StageResult:
+    """samples, serial constants → calibration, attitude, covariance, fit: everything in one likelihood."""
+    if s["method"] != METHOD:
+        return StageResult(status="absent", reason_code="not_selected", reason='The method is "serial".')
+    if "samples" not in tables:
+        return StageResult(status="refused", reason_code="no_samples", reason="No segment of the log is usable.")
+    fault = fatal_fault(tables["faults"], ("gyroscope",)) if "faults" in tables else None
+    if fault is not None:
+        return StageResult(status="refused", reason_code=fault["reason_code"], reason=fault["reason"])
+    if tables["samples"]["gyroscope_x"].null_count():
+        return StageResult(status="refused", reason_code="no_gyroscope", reason="The joint estimate needs a gyroscope.")
+    readings = readings_of(tables, s)
+    axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    arm = None if s["lever_arm_m"] is None else axes.T @ np.asarray(s["lever_arm_m"], dtype=float)
+    try:
+        model, start = joint_start.prepare(readings, start_constants(tables, s, readings), lever_arm=arm)
+        fit = fit_joint(model, start, try_lever_arm=arm is None)
+    except (UnusableFlight, EstimationError) as error:
+        return refusal(error, "joint estimate")
+    result = _written(fit, tables, s, axes)
+    return replace(result, tables={**result.tables, **_held_out(fit, readings, tables, s, arm)})
+
+
+def _held_out(
+    fit: JointFit, readings: Readings, tables: Tables, s: Settings, arm: Array | None
+) -> dict[str, pl.DataFrame]:
+    """Gyroscope constants from the first part of the flight alone, with `from_ns`, where the rest begins: `verify`
+    predicts that. None where the part determines nothing."""
+    split = int(HELD_IN_SHARE * len(readings.t))
+    part = replace(
+        readings,
+        t=readings.t[:split],
+        segment=readings.segment[:split],
+        turning=readings.turning[:, :split],
+        gyroscope=readings.gyroscope[:split],
+        accelerometer=None if readings.accelerometer is None else readings.accelerometer[:split],
+        magnetometer=None if readings.magnetometer is None else readings.magnetometer[:split],
+    )
+    known = {name: fit.constants(name)[:2] for name in SENSORS if name in fit.layout}
+    try:
+        own = fit_joint(*joint_start.prepare(part, known, lever_arm=arm), try_lever_arm=arm is None)
+    except (UnusableFlight, EstimationError):
+        return {}
+    scale, bias, covariance = own.constants("gyroscope")
+    rows = triad_rows(
+        "gyroscope",
+        METHOD,
+        np.diag(scale),
+        bias,
+        covariance,
+        unit="rad/s",
+        logged_unit=s["units"]["gyroscope"],
+        reference_reading=reference_reading(s, "gyroscope", readings.gyroscope),
+        temperature_degc=mean_temperature(tables),
+    )
+    return {"held_out": calibration_rows(rows).with_columns(from_ns=pl.lit(int(tables["samples"]["t_ns"][split])))}
+
+
+def readings_of(tables: Tables, s: Settings) -> Readings:
+    """Logged readings of the used segments; a slow magnetometer's only at the samples nearest to its
+    own stamps; none of a triad with a fatal fault."""
+    samples = tables["samples"]
+    t = seconds(samples["t_ns"], samples["t_ns"][0])
+    segment = samples["segment"].to_numpy()
+    logged = {name: matrix(samples, triad(name)) for name in SENSORS}
+    magnetometer = tables.get("magnetometer_log")
+    if magnetometer is not None and len(magnetometer) < SPARSE * len(tables["imu"]):
+        own = np.zeros(len(t), dtype=bool)
+        at = seconds(magnetometer["t_ns"], samples["t_ns"][0])
+        after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
+        nearest = np.where(at - t[after - 1] < t[after] - at, after - 1, after)
+        own[nearest[np.abs(t[nearest] - at) < 2.0 * float(np.median(np.diff(t)))]] = True
+        logged["magnetometer"] = np.where(own[:, None], logged["magnetometer"], np.nan)
+    sound = {name: "faults" not in tables or fatal_fault(tables["faults"], (name,)) is None for name in SENSORS}
+    given = {n: x if sound[n] and np.isfinite(x).any() else None for n, x in logged.items() if n != "gyroscope"}
+    return Readings(
+        t=t,
+        segment=segment,
+        gyroscope=logged["gyroscope"],
+        gravity_mps2=sensor.GRAVITY_SIGNS[s["gravity_sign"]] * s["gravity_mps2"],
+        field_ned=np.asarray(s["field_ned"], dtype=float),
+        turning=joint_start.turning(t, segment, logged["gyroscope"]),
+        **given,
+    )
+
+
+def start_constants(tables: Tables, s: Settings, readings: Readings) -> dict[str, tuple[Array, Array] | None]:
+    """The serial chain's constants where it has them, else what the logged unit says, else refused values, else own."""
+    out: dict[str, tuple[Array, Array] | None] = {}
+    magnitudes = {"magnetometer": float(np.linalg.norm(s["field_ned"])), "accelerometer": s["gravity_mps2"]}
+    for name in SENSORS:
+        found = None
+        for method in SERIAL_METHODS[name]:
+            if found is None and name in tables:
+                found = constants(tables[name], name, method)
+        found = found or logged_constants(s, name)
+        out[name] = None if found is None else (np.diagonal(found[0]).copy(), found[1])
+        logged = getattr(readings, name)
+        if out[name] is None and name in magnitudes and logged is not None:
+            polarity = np.asarray(s["polarity"][name], dtype=float)
+            out[name] = joint_start.start_of_triad(logged, magnitudes[name], polarity)
+    return out
+
+
+def _written(fit: JointFit, tables: Tables, s: Settings, axes: Array) -> StageResult:
+    """Rows with a status by sensor and axis, the attitude, the covariance, and the numbers that decided."""
+    rows: list[dict[str, Any]] = []
+    codes: dict[str, list[str | None]] = {}
+    for name in SENSORS:
+        if name not in fit.layout:
+            continue
+        scale, bias, covariance = fit.constants(name)
+        codes[name] = _judged(name, fit, scale, covariance, s)
+        rows += triad_rows(
+            name,
+            METHOD,
+            np.diag(scale),
+            bias,
+            covariance,
+            unit=UNITS[name] or s["field_unit"],
+            logged_unit=s["units"][name],
+            reference_reading=reference_reading(s, name, matrix(tables["samples"], triad(name))),
+            temperature_degc=mean_temperature(tables),
+            status=tuple("refused" if code else "ok" for code in codes[name]),  # type: ignore[arg-type]
+            reason_code=tuple(codes[name]),  # type: ignore[arg-type]
+        )
+    bad = [f"{name} {axis}: {c}" for name, own in codes.items() for axis, c in zip(AXES, own, strict=True) if c]
+    every = len(bad) == 3 * len(codes)
+    measured = _measured(fit, axes)
+    first = next((code for own in codes.values() for code in own if code), None)
+    reason = f"Refused by the joint estimate ({', '.join(bad)}). {measured['advice']}".strip() if bad else None
+    result = {"calibration": calibration_rows(rows), "covariance": covariance_table(fit.covariance)}
+    if not any(codes["gyroscope"]):
+        result["attitude"] = _attitude_table(fit, tables, axes)
+    return StageResult(result, "refused" if every else "ok", first, reason, measured)
+
+
+def _judged(name: str, fit: JointFit, scale: Array, covariance: Array, s: Settings) -> list[str | None]:
+    """Why an axis is refused, or None."""
+    if name == "gyroscope":
+        if gyro_noise_share(fit) > MAX_GYRO_NOISE_SHARE:
+            return ["gyro_contradicts_attitude"] * 3
+        limit = s["gyro_max_scale_sd"]
+    else:
+        if misfit(fit, name) > s["ellipsoid_max_residual"]:
+            return ["not_a_sphere"] * 3
+        limit = s["ellipsoid_max_scale_sd"]
+    relative = np.sqrt(np.diagonal(covariance)[:3]) / np.abs(scale)
+    polarity = np.asarray(s["polarity"][name], dtype=float)
+    nominal = s["nominal_scale"][name]
+    out: list[str | None] = []
+    for i in range(3):
+        ratio = 1.0 if nominal is None else abs(scale[i] / nominal[i])
+        if not relative[i] <= limit:
+            out.append("scale_uncertain")
+        elif np.sign(scale[i]) != polarity[i]:
+            out.append("polarity_contradiction")
+        else:
+            out.append(None if 0.5 <= ratio <= 2.0 else "scale_not_nominal")
+    return out
+
+
+def gyro_noise_share(fit: JointFit) -> float:
+    """What the attitude had to jump at the knots over what the gyroscope turned between them, rms."""
+    turned = np.sqrt(np.mean(np.sum(fit.path.rate**2, axis=1))) * fit.model.knots.interval_s
+    jumped = np.linalg.norm(fit.path.jump, axis=1)
+    return float(np.sqrt(np.mean(jumped**2) / np.mean(turned**2)))
+
+
+def misfit(fit: JointFit, name: str) -> float:
+    """Rms of a vector triad's residual (robust level) over the sensed length."""
+    row = 3 * fit.model.rows.index(name)
+    scale = fit.state.values[name][:3]
+    level = np.sqrt(np.sum(fit.levels.variance[row : row + 3] * scale**2))
+    readings = fit.model.readings
+    length = np.linalg.norm(readings.field_ned) if name == "magnetometer" else abs(readings.gravity_mps2)
+    return float(level / length)
+
+
+def _measured(fit: JointFit, axes: Array) -> dict[str, Any]:
+    relative = {}
+    for name in SENSORS:
+        if name in fit.layout:
+            scale, _, covariance = fit.constants(name)
+            relative[name] = [float(v) for v in np.sqrt(np.diagonal(covariance)[:3]) / np.abs(scale)]
+    measured: dict[str, Any] = {
+        "n_samples": len(fit.model.readings.t),
+        "iterations": fit.iterations,
+        "scale_relative_sd": relative,
+        "mean_robust_weight": {
+            name: float(fit.weight[fit.model.triads[name].known, 3 * i].mean()) for i, name in enumerate(fit.model.rows)
+        },
+        "misfit": {name: misfit(fit, name) for name in fit.model.rows},
+        "gyro_walk_deg_per_sqrt_s": float(np.degrees(np.sqrt(fit.levels.walk))),
+        "gyro_noise_share": gyro_noise_share(fit),
+        "translation_rms_mps2": float(np.sqrt(3.0) * fit.levels.strength),
+        "advice": advice(fit.model, fit.state, fit.layout, fit.covariance),
+    }
+    if "dip" in fit.layout:
+        own = fit.layout["dip"].start
+        measured |= {
+            "dip_deg": float(np.degrees(fit.state.values["dip"][0])),
+            "dip_sd_deg": float(np.degrees(np.sqrt(fit.covariance[own, own]))),
+        }
+    if fit.lever_arm_test is not None:
+        measured["lever_arm_test"] = fit.lever_arm_test
+    if "lever_arm" in fit.layout:
+        own = fit.layout["lever_arm"]
+        measured["lever_arm_m"] = [float(v) for v in axes @ fit.state.values["lever_arm"]]
+        measured["lever_arm_sd_m"] = [float(v) for v in np.sqrt(np.diagonal(axes @ fit.covariance[own, own] @ axes.T))]
+    return measured
+
+
+def _attitude_table(fit: JointFit, tables: Tables, axes: Array) -> pl.DataFrame:
+    """Attitude of the body and corrected rates of the sensor axes at every sample, weight 1."""
+    samples = tables["samples"]
+    q = multiply(fit.path.q, from_matrix(axes))
+    return pl.DataFrame(
+        {
+            "t_ns": samples["t_ns"],
+            "segment": samples["segment"],
+            **columns_of(q, QUATERNION),
+            "weight": np.ones(len(q)),
+        }
+    )

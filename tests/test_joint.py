@@ -1,0 +1,156 @@
+"""The joint estimator against the simulator's truth: exact without noise, honest with it, also where serial refuses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fieldcal import joint_start
+from fieldcal.errors import UnusableFlight
+from fieldcal.joint import JointFit, fit_joint
+from fieldcal.joint_model import TRIADS, Readings
+from fieldcal.rotation import angle_between
+from fieldcal.simulate import Experiment, Recording, constants_at, simulate
+from tests.numerics_support import rms
+
+LEVER_ARM_M = (0.05, 0.02, -0.03)
+MOVING = {"translation_rms_mps2": 0.3, "lever_arm_m": LEVER_ARM_M}
+# The rate is taken as linear between samples, readings are averaged over three of them, turns bend the truth in both.
+DISCRETISATION = 5e-4
+# Gyroscope noise in the low-passed rates draws the arm towards zero: a third of its length at the worst.
+LEVER_ARM_ERROR_M = 0.02
+SEEDS = (11, 12, 13, 14, 15, 16)
+
+
+def readings(r: Recording, **changes: Any) -> Readings:
+    e = r.experiment
+    segment = np.zeros(len(r.t), dtype=np.int64)
+    given: dict[str, Any] = {
+        "t": r.t,
+        "segment": segment,
+        **r.counts,
+        "gravity_mps2": e.gravity_mps2,
+        "field_ned": np.array([np.cos(e.dip_rad), 0.0, np.sin(e.dip_rad)]),
+        "turning": joint_start.turning(r.t, segment, r.counts["gyroscope"]),
+    }
+    return Readings(**{**given, **changes})
+
+
+def truth(r: Recording, name: str) -> tuple[np.ndarray, np.ndarray]:
+    scale, bias = constants_at(r.experiment, name, 25.0)
+    return np.asarray(scale), np.asarray(bias)
+
+
+def own_start(given: Readings, e: Experiment) -> dict[str, Any]:
+    """No word from the serial chain: ellipsoids of the triads, and polarity, which is configuration."""
+    sign = {name: np.sign(e.scale[name]) for name in TRIADS}
+    out: dict[str, Any] = {"gyroscope": None}
+    for name, logged, length in (
+        ("magnetometer", given.magnetometer, 1.0),
+        ("accelerometer", given.accelerometer, e.gravity_mps2),
+    ):
+        if logged is not None:
+            out[name] = joint_start.start_of_triad(logged, length, sign[name])
+    return out
+
+
+def fitted(r: Recording, **changes: Any) -> JointFit:
+    given = readings(r, **changes)
+    model, start = joint_start.prepare(given, own_start(given, r.experiment))
+    return fit_joint(model, start)
+
+
+def relative_errors(r: Recording, fit: JointFit, name: str) -> np.ndarray:
+    return np.asarray(fit.constants(name)[0] / truth(r, name)[0] - 1.0)
+
+
+def normalised_errors(r: Recording, fit: JointFit) -> np.ndarray:
+    """Error ÷ sd of the scales of every triad."""
+    out = []
+    for name in TRIADS:
+        if name in fit.layout:
+            scale, _, covariance = fit.constants(name)
+            out.append((scale - truth(r, name)[0]) / np.sqrt(np.diagonal(covariance)[:3]))
+    return np.concatenate(out)
+
+
+def test_noise_free_truth_is_recovered() -> None:
+    r = simulate(seed=1, noise=False, quantisation=False, band_limit=False)
+    fit = fitted(r)
+    for name in TRIADS:
+        assert np.abs(relative_errors(r, fit, name)).max() < DISCRETISATION, name
+    assert np.degrees(rms(angle_between(fit.path.q, r.q))) < 0.01
+    assert not fit.state.values["lever_arm"].any()
+
+
+@pytest.fixture(scope="module")
+def moving() -> list[tuple[Recording, JointFit]]:
+    recordings = [simulate(seed=seed, **MOVING) for seed in SEEDS]
+    return [(r, fitted(r)) for r in recordings]
+
+
+def test_translation_and_an_unknown_lever_arm_cost_little(moving: list[tuple[Recording, JointFit]]) -> None:
+    """The serial chain refuses or misses these by tens of per cent. Medians; `benchmarks/joint_accuracy.py` has 32."""
+    for name, bar in (("magnetometer", 0.009), ("accelerometer", 0.016), ("gyroscope", 0.011)):
+        assert np.median([rms(relative_errors(r, fit, name)) for r, fit in moving]) < bar, name
+    assert np.median([np.degrees(rms(angle_between(fit.path.q, r.q))) for r, fit in moving]) < 0.9
+    for _, fit in moving:
+        assert np.abs(fit.state.values["lever_arm"] - LEVER_ARM_M).max() < LEVER_ARM_ERROR_M
+
+
+def test_claimed_standard_deviations_are_honest(moving: list[tuple[Recording, JointFit]]) -> None:
+    assert 0.4 < np.median([np.mean(normalised_errors(r, fit) ** 2) for r, fit in moving]) < 1.6
+
+
+def test_clean_flights_keep_no_lever_arm_and_honest_sd() -> None:
+    nees = []
+    for seed in SEEDS[:4]:
+        r = simulate(seed=seed)
+        fit = fitted(r)
+        assert "lever_arm" not in fit.layout
+        assert rms(relative_errors(r, fit, "accelerometer")) < 0.011
+        nees.append(np.mean(normalised_errors(r, fit) ** 2))
+    assert 0.2 < np.mean(nees) < 2.5
+
+
+def test_units_and_axis_order_do_not_matter() -> None:
+    r = simulate(seed=2, duration_s=30.0)
+    fit = fitted(r)
+    scaled = fitted(r, accelerometer=r.counts["accelerometer"] * 0.01 - 3.0)
+    ratio = scaled.constants("accelerometer")[0] * 0.01 / fit.constants("accelerometer")[0]
+    assert np.abs(ratio - 1.0).max() < 1e-3
+
+
+def test_one_vector_triad_suffices_with_a_known_unit() -> None:
+    r = simulate(seed=3)
+    gyro = truth(r, "gyroscope")
+    for missing, name in (("magnetometer", "accelerometer"), ("accelerometer", "magnetometer")):
+        given = readings(r, **{missing: None})
+        start = own_start(given, r.experiment) | {"gyroscope": (gyro[0] * 1.02, gyro[1])}
+        fit = fit_joint(*joint_start.prepare(given, start))
+        assert missing not in fit.layout
+        assert rms(relative_errors(r, fit, name)) < 0.02
+        assert rms(relative_errors(r, fit, "gyroscope")) < 0.02
+
+
+def test_no_start_is_refused() -> None:
+    r = simulate(seed=4, duration_s=20.0)
+    given = readings(r, magnetometer=None)
+    with pytest.raises(UnusableFlight) as error:
+        joint_start.prepare(given, own_start(given, r.experiment))
+    assert error.value.reason_code == "no_start"
+
+
+def test_gaps_and_magnetic_bursts_are_survived() -> None:
+    r = simulate(seed=5, magnetic_bursts=4, lost_share=0.01)
+    kept = (r.t < 14.0) | (r.t > 15.0)
+    counts = {name: x[kept] for name, x in r.counts.items()}
+    t = r.t[kept]
+    segment = (t > 14.5).astype(np.int64)
+    fit = fitted(
+        r, t=t, segment=segment, turning=joint_start.turning(t, segment, counts["gyroscope"]), **counts
+    )  # fmt: skip
+    for name in TRIADS:
+        assert rms(relative_errors(r, fit, name)) < 0.012, name
