@@ -163,7 +163,7 @@ PIPELINE: tuple[Stage, ...] = (
             "sanity": "sanity.faults",
         },
         (),
-        ("calibration",),
+        ("calibration", "faults"),
         ("field_ned", "field_unit", "polarity"),
     ),
     Stage(
@@ -210,6 +210,7 @@ PIPELINE: tuple[Stage, ...] = (
             "magnetometer": "magnetometer.calibration",
             "accelerometer": "accelerometer_pass2.calibration",
             "gyroscope": "gyro_output.calibration",
+            "motor_faults": "vectors.faults",
         },
         (),
         ("calibration", "covariance", "attitude", "held_out"),

@@ -123,7 +123,6 @@ def test_what_says_nothing() -> None:
     h = field_ut()
     assert motor_field(h, np.full(len(h), 12.0), FIELD_UT) is None
     assert motor_field(h[:50], np.arange(50.0), FIELD_UT) is None
-    assert motor_field(np.zeros_like(h), np.arange(float(len(h))), FIELD_UT) is None
     assert motor_field(h * np.inf, np.arange(float(len(h))), FIELD_UT) is None
 
 
@@ -221,6 +220,15 @@ def test_a_field_of_thirteen_per_cent_refuses_the_magnetometer_with_the_number(t
     assert (fault["fatal"], fault["limit"]) == (True, FATAL)
     assert fault["value"] == pytest.approx(0.13, abs=0.015)
     assert "No constant calibration describes it" in fault["sentence"]
+
+
+def test_the_joint_estimate_leaves_such_a_magnetometer_out(tmp_path: Path) -> None:
+    log = flown(tmp_path, 0.13, "current_a", memory=0.95)
+    config = tmp_path / "fieldcal.toml"
+    text = config.read_text(encoding="utf-8").replace('world = "ned"', 'world = "ned"\nmethod = "joint"')
+    config.write_text(text, encoding="utf-8")
+    rows = calibrate_log(log)["calibration"]
+    assert [r for r in rows if r["sensor"] == "magnetometer" and r["status"] == "ok"] == []
 
 
 @pytest.mark.parametrize("share", [0.13, 0.3])

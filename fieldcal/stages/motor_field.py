@@ -28,8 +28,8 @@ DRIVES = {"current_a": ("current", "A"), "throttle": ("throttle", "")}
 
 
 def check_motor_field(tables: Tables, s: Settings) -> tuple[dict[str, Any], list[Fault]]:
-    """power, readings and constants of the magnetometer → measured numbers and faults; both empty without a current, and
-    where the readings are insane already."""
+    """power, readings and constants of the magnetometer → measured numbers and faults; both empty without a current
+    and where the readings are insane already."""
     if not {"power", "readings", "segments"} <= tables.keys():
         return {}, []
     if "sanity" in tables and fatal_fault(tables["sanity"], ("magnetometer",)) is not None:

@@ -211,9 +211,10 @@ def _lever_arm(samples: pl.DataFrame, rate: Array, s: Settings) -> Array:
 
 
 def judge_vectors(tables: Tables, s: Settings) -> StageResult:
-    """Both vector triads' calibrations and what the attitude and the motors' current say of them → calibration: a fit
-    by length alone cannot see polarity or axes, so where attitude says that they contradict each other neither is
-    good."""
+    """Both vector triads' calibrations and what the attitude and the motors' current say of them → calibration, faults.
+
+    A fit by length alone cannot see polarity or axes, so where attitude says that they contradict each other neither
+    is good."""
     measured, motor_faults = check_motor_field(tables, s)
     faults = fault_rows(motor_faults)
     if "faults" in tables:
@@ -230,10 +231,12 @@ def judge_vectors(tables: Tables, s: Settings) -> StageResult:
             parts.append(tables[name])
     if not parts:
         return StageResult(status="absent", reason_code="no_vectors", reason="Neither vector triad was calibrated.")
+    told = {}
     if motor_faults:
         measured["faults"] = [fault.plain() for fault in motor_faults]
+        told = {"faults": fault_rows(motor_faults)}
     return StageResult(
-        {"calibration": pl.concat(parts)},
+        {"calibration": pl.concat(parts), **told},
         reason_code=motor_faults[0].code if motor_faults else None,
         reason=" ".join(fault.sentence for fault in motor_faults) or None,
         measured=measured,
