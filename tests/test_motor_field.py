@@ -222,7 +222,15 @@ def test_a_field_of_thirteen_per_cent_refuses_the_magnetometer_with_the_number(t
     assert "No constant calibration describes it" in fault["sentence"]
 
 
-def test_the_joint_estimate_leaves_such_a_magnetometer_out(tmp_path: Path) -> None:
+def test_no_gyroscope_is_fitted_to_an_attitude_from_such_a_magnetometer(tmp_path: Path) -> None:
+    """Its scale would be off by 5 % about z."""
+    document = calibrate_log(flown(tmp_path, 0.13, "current_a", memory=0.95))
+    assert [r for r in document["calibration"] if r["sensor"] == "gyroscope" and r["status"] == "ok"] == []
+    pass2 = next(row for row in document["run"] if row["stage"] == "gyro_equation_pass2")
+    assert (pass2["status"], pass2["reason_code"]) == ("refused", "motor_field")
+
+
+def test_the_joint_estimate_publishes_no_such_magnetometer(tmp_path: Path) -> None:
     log = flown(tmp_path, 0.13, "current_a", memory=0.95)
     config = tmp_path / "fieldcal.toml"
     text = config.read_text(encoding="utf-8").replace('world = "ned"', 'world = "ned"\nmethod = "joint"')
