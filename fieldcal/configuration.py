@@ -48,7 +48,7 @@ class Field:
 class CsvMap:
     """Where a vehicle's CSV logs differ from the default columns. `imu` and `vps` hold configured names only.
 
-    Keys of `imu`: t, gyroscope, accelerometer, magnetometer (three names each), temperature;
+    Keys of `imu`: t, gyroscope, accelerometer, magnetometer (three names each), temperature, current, throttle;
     of `vps`: t, quaternion_xyzw (four names), position (three). Both empty: the default names are meant.
     """
 
@@ -68,6 +68,7 @@ class McapMap:
     magnetometer: str | None = None
     vps: str | None = None
     temperature: str | None = None
+    power: str | None = None
     position: str | None = None
     imu_fields: dict[str, Paths] | None = None
     time: str = "header"
@@ -206,7 +207,7 @@ def _field(value: Any, place: Place) -> Field:
 
 
 def _csv_imu(value: Any, place: Place) -> dict[str, Paths]:
-    raw = check.table(value, place, ("t", *SENSORS, "temperature"))
+    raw = check.table(value, place, ("t", *SENSORS, "temperature", "current", "throttle"))
     return {k: check.texts(v, place / k, 3) if k in SENSORS else check.text(v, place / k) for k, v in raw.items()}
 
 
@@ -262,7 +263,7 @@ _CSV_KEYS: dict[str, Callable[[Any, Place], Any]] = {
     "decimal": partial(check.choice, allowed=(".", ",")),
 }
 _MCAP_KEYS: dict[str, Callable[[Any, Place], Any]] = {
-    **dict.fromkeys(("imu", "magnetometer", "vps", "temperature", "position"), check.text),
+    **dict.fromkeys(("imu", "magnetometer", "vps", "temperature", "power", "position"), check.text),
     "imu_fields": _imu_fields,
     "time": partial(check.choice, allowed=("header", "log")),
 }

@@ -157,15 +157,19 @@ PIPELINE: tuple[Stage, ...] = (
             "magnetometer": "magnetometer.calibration",
             "accelerometer": "accelerometer_pass2.calibration",
             "faults": "attitude_pass2.faults",
+            "readings": "ingest.magnetometer",
+            "segments": "manoeuvre.segments",
+            "power": "ingest.power",
+            "sanity": "sanity.faults",
         },
         (),
-        ("calibration",),
-        (),
+        ("calibration", "faults"),
+        ("field_ned", "field_unit", "polarity"),
     ),
     Stage(
         "gyro_equation_pass2",
         gyroscope.calibrate_gyro_equation,
-        {**SAMPLES, "attitude": "attitude_pass2.attitude"},
+        {**SAMPLES, "attitude": "attitude_pass2.attitude", "attitude_faults": "vectors.faults"},
         ("samples", "attitude"),
         ("calibration", "covariance"),
         (*GYRO, "equations", "differentiation_window_s"),
@@ -206,6 +210,7 @@ PIPELINE: tuple[Stage, ...] = (
             "magnetometer": "magnetometer.calibration",
             "accelerometer": "accelerometer_pass2.calibration",
             "gyroscope": "gyro_output.calibration",
+            "motor_faults": "vectors.faults",
         },
         (),
         ("calibration", "covariance", "attitude", "held_out"),
@@ -279,8 +284,9 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
 def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: Mapping[str, Any]) -> StageResult:
     """Run one stage on `stage.table` tables; missing needs end as a refusal that names them."""
     inputs = {own: tables[name] for own, name in stage.reads.items() if name in tables}
-    if stage.trusts and "faults" in inputs:
-        fault = fatal_fault(inputs["faults"], stage.trusts)
+    # An attitude is as good as the vectors that it came from.
+    for faults, sensors in (("faults", stage.trusts), ("attitude_faults", attitude.VECTOR_SENSORS)):
+        fault = fatal_fault(inputs[faults], sensors) if faults in inputs else None
         if fault is not None:
             return StageResult(
                 status="refused",

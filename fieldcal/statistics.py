@@ -89,6 +89,13 @@ def _coloured(s: Array, r: Array) -> tuple[Array, float]:
     return middle, independent
 
 
+def independent_samples(residual: ArrayLike) -> float:
+    """How many independent samples the residual (n,), in order of time, is worth: n over the sum of its tapered
+    autocorrelation, n at most."""
+    r = np.asarray(residual, dtype=float)
+    return _coloured(np.zeros((len(r), 1, 0)), r[:, None])[1]
+
+
 def least_squares_covariance(sensitivity: ArrayLike, residual: ArrayLike, *, nuisance: int = 0) -> tuple[Array, Array]:
     """Covariances of a least-squares fit: (Cramér–Rao σ²M⁻¹, coloured M⁻¹[ΣΣ Sᵀ𝓡S]M⁻¹), each (p, p).
 

@@ -15,7 +15,7 @@ from fieldcal.errors import UnreadableLog
 from fieldcal.logs import SIGNAL_COLUMNS, Columns, Finding, batch_frame
 
 SENSOR_TABLES = ("imu", "magnetometer", "vps")
-MAY_BE_UNKNOWN = ("px_m", "py_m", "pz_m", "altitude_m")
+MAY_BE_UNKNOWN = ("px_m", "py_m", "pz_m", "altitude_m", "current_a", "throttle")
 HELD_ROWS = 1 << 17
 WHOLE_ROWS_CAP = 6_000_000
 CLOCK_RESET_NS = 1_000_000_000

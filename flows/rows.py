@@ -71,7 +71,7 @@ def run_rows(leading: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]
 
 def judged(facts: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """The facts with what the stages found: a stage that failed makes an `ok` log `partial`, faults are findings."""
-    faults = records["sanity"]["measured"].get("faults", []) if "sanity" in records else []
+    faults = [fault for record in records.values() for fault in record["measured"].get("faults", [])]
     told = [{"code": fault["code"], "count": 1, "sentence": fault["sentence"]} for fault in faults]
     facts = {**facts, "findings": [*facts["findings"], *told]}
     failed = [record for record in records.values() if record["status"] == "failed"]

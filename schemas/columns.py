@@ -87,6 +87,15 @@ POSITION = tuple(
 LATITUDE_DEG = Column("latitude_deg", _F64, "deg", "geodetic latitude, WGS 84, north positive")
 LONGITUDE_DEG = Column("longitude_deg", _F64, "deg", "longitude, WGS 84, east positive")
 ALTITUDE_M = Column("altitude_m", _F64, "m", "altitude as the log has it (above the ellipsoid or mean sea level)")
+CURRENT_A = Column(
+    "current_a",
+    _F64,
+    "A",
+    "current of battery or motors as the log has it; of a ROS BatteryState, negative while discharging, the magnitude",
+)
+THROTTLE = Column(
+    "throttle", _F64, "1", "throttle, 0 to 1 of full; what is logged in another unit stands as logged and is not used"
+)
 ATTITUDE_SD_RAD = Column(
     "attitude_sd_rad",
     _F64,

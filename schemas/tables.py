@@ -34,6 +34,14 @@ _SIGNALS = (
         (c.T_NS, c.LATITUDE_DEG, c.LONGITUDE_DEG, c.ALTITUDE_M),
         ("t_ns",),
     ),
+    Table(
+        "power",
+        "signal",
+        1,
+        "what drives the motors, for the field that they make; either may be null",
+        (c.T_NS, c.CURRENT_A, c.THROTTLE),
+        ("t_ns",),
+    ),
 )
 
 _STAGES = (

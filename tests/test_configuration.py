@@ -47,10 +47,13 @@ gyroscope = ["gx","gy","gz"]
 accelerometer = ["ax","ay","az"]
 magnetometer = ["mx","my","mz"]
 temperature = "temp"
+current = "amps"
+throttle = "throttle"
 [vehicles."morpheus-1".mcap]
 imu = "/imu/data_raw"
 magnetometer = "/imu/mag"
 vps = "/vps/pose"
+power = "/battery"
 time = "log"
 imu_fields = { gyroscope = "gyro", accelerometer = ["a.x", "a.y", "a.z"], magnetometer = "mag", temperature = "t" }
 [archive]
@@ -105,6 +108,7 @@ def test_every_key_of_the_contract_is_understood() -> None:
     assert vehicle.nominal_scale["accelerometer"] == (4e-3, 4e-3, 5e-3)
     assert vehicle.reference_reading == {"gyroscope": (33000.0, 32400.0, 32900.0)}
     assert vehicle.csv.imu["gyroscope"] == ("gx", "gy", "gz")
+    assert (vehicle.csv.imu["current"], vehicle.mcap.power) == ("amps", "/battery")
     assert vehicle.csv.vps["quaternion_xyzw"] == ("qx", "qy", "qz", "qw")
     assert (vehicle.csv.separator, vehicle.csv.decimal, vehicle.csv.rate_hz) == (";", ",", 100.0)
     assert (vehicle.mcap.imu, vehicle.mcap.time) == ("/imu/data_raw", "log")

@@ -28,6 +28,7 @@ from fieldcal.logs.interface import (
 from fieldcal.logs.interface import Columns as BatchColumns
 
 VPS_COLUMNS = {"quaternion_xyzw": ("qx", "qy", "qz", "qw"), "position": ("px_m", "py_m", "pz_m")}
+POWER_COLUMNS = {"current": ("current_a",), "throttle": ("throttle",)}
 _LINES_LOOKED_AT = 50
 _LOSS_SENTENCES = {
     "ragged_row": ("have more or fewer fields than the header and were left out", True),
@@ -182,6 +183,8 @@ class CsvTable:
                     bad |= cells[str(place)][1]
             required = [out for key, outs in groups for out in outs if key != "position"]
             there = np.stack([np.isfinite(values[out]) for out in required])
+            if table == "power":
+                there = np.stack([there.any(axis=0)])  # one of the two will do
             absent = ~there.any(axis=0) & ~bad
             losses.add("bad_number", numbers[bad])
             losses.add("incomplete_row", numbers[~there.all(axis=0) & ~absent & ~bad])
@@ -208,6 +211,7 @@ class CsvTable:
             ("imu", [(key, axes[key]) for key in inertial]),
             ("magnetometer", [("magnetometer", axes["magnetometer"])] if "magnetometer" in imu else []),
             ("temperature", [("temperature", ("temperature_degc",))] if "temperature" in imu else []),
+            ("power", [(key, outs) for key, outs in POWER_COLUMNS.items() if key in imu]),
             ("vps", [(key, outs) for key, outs in VPS_COLUMNS.items() if key in vps]),
         ]
 

@@ -17,6 +17,8 @@ IMU_DEFAULTS: dict[str, tuple[str, ...]] = {
     "accelerometer": ("ax", "ay", "az"),
     "magnetometer": ("mx", "my", "mz"),
     "temperature": ("temp",),
+    "current": ("current_a",),
+    "throttle": ("throttle",),
 }
 VPS_DEFAULTS: dict[str, tuple[str, ...]] = {
     "quaternion_xyzw": ("qx", "qy", "qz", "qw"),

@@ -30,6 +30,7 @@ SIGNAL_COLUMNS: Mapping[str, tuple[str, ...]] = {
     "temperature": ("t_ns", "temperature_degc"),
     "vps": ("t_ns", "qx", "qy", "qz", "qw", "px_m", "py_m", "pz_m"),
     "position": ("t_ns", "latitude_deg", "longitude_deg", "altitude_m"),
+    "power": ("t_ns", "current_a", "throttle"),
 }
 
 KNOWN_UNITS: Mapping[str, tuple[str, ...]] = {

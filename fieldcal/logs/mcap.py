@@ -106,6 +106,9 @@ class McapLog:
             yield "magnetometer", _columns(t_ns, values, ["magnetometer"])
         elif source.role == "temperature":
             yield from _finite("temperature", {"t_ns": t_ns, "temperature_degc": values["temperature"]})
+        elif source.role == "power":
+            # ROS: negative while discharging, NaN where it is not measured.
+            yield from _finite("power", {"t_ns": t_ns, "current_a": np.abs(values["current"])})
         elif source.role == "vps":
             columns: Columns = {"t_ns": t_ns}
             for number, component in enumerate(COMPONENTS[4]):

@@ -1,4 +1,4 @@
-"""Which topic of an MCAP file is what: the inertial unit, the magnetometer, the VPS, temperature, position."""
+"""Which topic of an MCAP file is what: the inertial unit, the magnetometer, the VPS, temperature, current, position."""
 
 from __future__ import annotations
 
@@ -44,6 +44,7 @@ KNOWN_TYPES: Mapping[str, Mapping[str, Mapping[str, Want]]] = {
     },
     "magnetometer": {"sensor_msgs/MagneticField": {"magnetometer": Want.of("magnetic_field", 3)}},
     "temperature": {"sensor_msgs/Temperature": {"temperature": Want.of("temperature", 1)}},
+    "power": {"sensor_msgs/BatteryState": {"current": Want.of("current", 1)}},
     "position": {"sensor_msgs/NavSatFix": _POSITION, "foxglove/LocationFix": _POSITION},
     "vps": {
         "geometry_msgs/PoseStamped": _POSE,
@@ -79,7 +80,7 @@ def choose_sources(definitions: Definitions, mapping: Any, summary: LogSummary, 
     definitions : Definitions
         Schemas and channels of the file.
     mapping : McapMap
-        Configured topics (`imu`, `magnetometer`, `vps`, `temperature`, `position`) and `imu_fields`.
+        Configured topics (`imu`, `magnetometer`, `vps`, `temperature`, `power`, `position`) and `imu_fields`.
     summary : LogSummary
         Receives findings.
     log_name : str

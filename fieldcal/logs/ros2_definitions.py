@@ -199,6 +199,12 @@ BUILTIN = {
         "std_msgs/Header header\ngeometry_msgs/Vector3 magnetic_field\nfloat64[9] magnetic_field_covariance"
     ),
     "sensor_msgs/Temperature": "std_msgs/Header header\nfloat64 temperature\nfloat64 variance",
+    "sensor_msgs/BatteryState": (
+        "std_msgs/Header header\nfloat32 voltage\nfloat32 temperature\nfloat32 current\nfloat32 charge\n"
+        "float32 capacity\nfloat32 design_capacity\nfloat32 percentage\nuint8 power_supply_status\n"
+        "uint8 power_supply_health\nuint8 power_supply_technology\nbool present\nfloat32[] cell_voltage\n"
+        "float32[] cell_temperature\nstring location\nstring serial_number"
+    ),
     "sensor_msgs/NavSatStatus": "int8 status\nuint16 service",
     "sensor_msgs/NavSatFix": (
         "std_msgs/Header header\nsensor_msgs/NavSatStatus status\nfloat64 latitude\nfloat64 longitude\n"

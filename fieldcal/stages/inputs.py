@@ -25,6 +25,15 @@ def mean_temperature(tables: Tables) -> float | None:
     return None if table is None or table.is_empty() else float(table["temperature_degc"].mean())  # type: ignore[arg-type]
 
 
+def in_used_segments(table: pl.DataFrame, segments: pl.DataFrame) -> np.ndarray:
+    """Which rows of a signal table lie in used segments, (n,)."""
+    t = table["t_ns"].to_numpy()
+    inside = np.zeros(len(t), dtype=bool)
+    for start, end in segments.filter(pl.col("used")).select("start_ns", "end_ns").iter_rows():
+        inside |= (t >= start) & (t <= end)
+    return inside
+
+
 def reference_reading(s: Settings, name: str, logged: Array) -> Array:
     configured = s["reference_reading"][name]
     return default_reference_reading(logged, s["units"][name]) if configured is None else np.asarray(configured)

@@ -116,7 +116,8 @@ def readings_of(tables: Tables, s: Settings) -> Readings:
         nearest = np.where(at - t[after - 1] < t[after] - at, after - 1, after)
         own[nearest[np.abs(t[nearest] - at) < 2.0 * float(np.median(np.diff(t)))]] = True
         logged["magnetometer"] = np.where(own[:, None], logged["magnetometer"], np.nan)
-    sound = {name: "faults" not in tables or fatal_fault(tables["faults"], (name,)) is None for name in SENSORS}
+    told = [tables[name] for name in ("faults", "motor_faults") if name in tables]
+    sound = {name: all(fatal_fault(faults, (name,)) is None for faults in told) for name in SENSORS}
     given = {n: x if sound[n] and np.isfinite(x).any() else None for n, x in logged.items() if n != "gyroscope"}
     return Readings(
         t=t,

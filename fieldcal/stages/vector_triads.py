@@ -11,17 +11,19 @@ from fieldcal import ellipsoid, manoeuvre, sensor
 from fieldcal.ellipsoid import TriadFit
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.frames import calibration_rows, constants, covariance_table, matrix, seconds, triad
-from fieldcal.results import StageResult, fatal_fault, triad_rows
+from fieldcal.results import StageResult, fatal_fault, fault_rows, triad_rows
 from fieldcal.rotation import Array
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import (
     Settings,
     Tables,
     differentiate_by_segment,
+    in_used_segments,
     mean_temperature,
     reference_reading,
     refusal,
 )
+from fieldcal.stages.motor_field import check_motor_field
 
 ELLIPSOID_METHOD = {
     "robust": "ellipsoid_robust",
@@ -66,12 +68,7 @@ def _used_readings(tables: Tables, name: str) -> Array | None:
         table = tables.get("magnetometer")
         if table is None or table.is_empty():
             return None
-        segments = tables["segments"].filter(pl.col("used"))
-        t = table["t_ns"].to_numpy()
-        inside = np.zeros(len(t), dtype=bool)
-        for start, end in segments.select("start_ns", "end_ns").iter_rows():
-            inside |= (t >= start) & (t <= end)
-        values = matrix(table, triad(name))[inside]
+        values = matrix(table, triad(name))[in_used_segments(table, tables["segments"])]
     else:
         values = matrix(tables["samples"], triad(name))
     return None if len(values) == 0 or np.isnan(values).all() else values[np.isfinite(values).all(axis=1)]
@@ -214,13 +211,19 @@ def _lever_arm(samples: pl.DataFrame, rate: Array, s: Settings) -> Array:
 
 
 def judge_vectors(tables: Tables, s: Settings) -> StageResult:
-    """Both vector triads' calibrations and what the attitude found of them → calibration: a fit by length alone cannot
-    see polarity or axes, so where attitude says that they contradict each other neither is good."""
+    """Both vector triads' calibrations and what the attitude and the motors' current say of them → calibration, faults.
+
+    A fit by length alone cannot see polarity or axes, so where attitude says that they contradict each other neither
+    is good."""
+    measured, motor_faults = check_motor_field(tables, s)
+    faults = fault_rows(motor_faults)
+    if "faults" in tables:
+        faults = pl.concat([faults, tables["faults"]])
     parts = []
     for name in ("magnetometer", "accelerometer"):
         if name not in tables:
             continue
-        fault = fatal_fault(tables["faults"], (name,)) if "faults" in tables else None
+        fault = fatal_fault(faults, (name,))
         if fault is not None:
             code = pl.when(pl.col("status") == "ok").then(pl.lit(fault["reason_code"])).otherwise("reason_code")
             parts.append(tables[name].with_columns(status=pl.lit("refused"), reason_code=code))
@@ -228,4 +231,13 @@ def judge_vectors(tables: Tables, s: Settings) -> StageResult:
             parts.append(tables[name])
     if not parts:
         return StageResult(status="absent", reason_code="no_vectors", reason="Neither vector triad was calibrated.")
-    return StageResult({"calibration": pl.concat(parts)})
+    told = {}
+    if motor_faults:
+        measured["faults"] = [fault.plain() for fault in motor_faults]
+        told = {"faults": fault_rows(motor_faults)}
+    return StageResult(
+        {"calibration": pl.concat(parts), **told},
+        reason_code=motor_faults[0].code if motor_faults else None,
+        reason=" ".join(fault.sentence for fault in motor_faults) or None,
+        measured=measured,
+    )

@@ -1,0 +1,98 @@
+"""Does the calibrated magnetometer go with the motors' current, where a log has one?"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal import ellipsoid, motor_field, sensor
+from fieldcal.errors import EstimationError, UnusableFlight
+from fieldcal.frames import constants, matrix, triad
+from fieldcal.results import fatal_fault
+from fieldcal.rotation import Array
+from fieldcal.sensor_sanity import Fault
+from fieldcal.stages.inputs import Settings, Tables, in_used_segments
+
+PAUSE_S = 1.0
+PAUSE = 5.0
+"""The current is interpolated over so many of its intervals, and over PAUSE_S, at the most."""
+
+MOST_SAMPLES = 50_000
+"""A longer flight's magnetometer is thinned to fewer: the current is slow."""
+
+DRIVES = {"current_a": ("current", "A"), "throttle": ("throttle", "")}
+"""What drives the motors, the better one first: column → word and unit."""
+
+
+def check_motor_field(tables: Tables, s: Settings) -> tuple[dict[str, Any], list[Fault]]:
+    """power, readings and constants of the magnetometer → measured numbers and faults; both empty without a current
+    and where the readings are insane already."""
+    if not {"power", "readings", "segments"} <= tables.keys():
+        return {}, []
+    if "sanity" in tables and fatal_fault(tables["sanity"], ("magnetometer",)) is not None:
+        return {}, []
+    readings = tables["readings"].filter(pl.Series(in_used_segments(tables["readings"], tables["segments"])))
+    values = matrix(readings, triad("magnetometer"))
+    whole = np.isfinite(values).all(axis=1)
+    if np.count_nonzero(whole) < motor_field.FEWEST:
+        return {}, []
+    known = _approximate(tables, s, values[whole])
+    if known is None:
+        return {}, []
+    for column, (word, unit) in DRIVES.items():
+        power = tables["power"].filter(pl.col(column).is_finite())
+        if len(power) < 2:
+            continue
+        if column == "throttle" and (outside := _outside(power[column].to_numpy())) is not None:
+            return {}, [outside]
+        drive = _drive_at(readings["t_ns"].to_numpy(), power["t_ns"].to_numpy(), power[column].to_numpy())
+        rows = np.flatnonzero(whole & np.isfinite(drive))
+        rows = rows[:: 1 + len(rows) // MOST_SAMPLES]
+        field = sensor.calibrate(values[rows], *known)
+        found = motor_field.motor_field(field, drive[rows], float(np.linalg.norm(s["field_ned"])))
+        if found is None:
+            continue
+        fault = motor_field.motor_fault(found, word, unit, s["field_unit"])
+        numbers = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(found).items()}
+        return {"motor_field": {"drive": column, **numbers}}, [fault] if fault else []
+    return {}, []
+
+
+def _approximate(tables: Tables, s: Settings, values: Array) -> tuple[Array, Array] | None:
+    """Scale and bias to start from: the magnetometer's, of a refused fit too (the current may be why it was refused),
+    else the algebraic fit's; what a constant ellipsoid lacks is fitted beside the current's field."""
+    own = constants(tables["magnetometer"], "magnetometer", refused_too=True) if "magnetometer" in tables else None
+    if own is not None and all(np.isfinite(c).all() for c in own):
+        return own
+    strength, polarity = float(np.linalg.norm(s["field_ned"])), s["polarity"]["magnetometer"]
+    try:
+        fit = ellipsoid.fit_ellipsoid(values, strength, method="li", polarity=polarity)
+    except (UnusableFlight, EstimationError, ValueError):
+        return None
+    return fit.scale, fit.bias
+
+
+def _drive_at(t_ns: np.ndarray, own_ns: np.ndarray, values: Array) -> Array:
+    """Drive at the stamps, (n,), linear between its own; NaN before, behind and in its pauses."""
+    at, known = (t_ns - own_ns[0]) * 1e-9, (own_ns - own_ns[0]) * 1e-9
+    result = np.interp(at, known, values, left=np.nan, right=np.nan)
+    longest = max(PAUSE_S, PAUSE * float(np.median(np.diff(known))))
+    right = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
+    result[known[right] - known[right - 1] > longest] = np.nan
+    return result
+
+
+def _outside(throttle: Array) -> Fault | None:
+    """A throttle that is not in 0 to 1 is in a unit that nobody told."""
+    low, high = float(throttle.min()), float(throttle.max())
+    if low >= 0.0 and high <= 1.0:
+        return None
+    sentence = (
+        f"The throttle runs from {low:.4g} to {high:.4g} where 0 to 1 is its range: it was not compared with the"
+        " magnetometer. Convert the column, or name the current's as csv.imu.current."
+    )
+    worst = high if high > 1.0 else low
+    return Fault("throttle", "", "throttle_range", worst, 1.0 if high > 1.0 else 0.0, False, sentence)
