@@ -26,24 +26,28 @@ def run_night(
     """Run the flow `nightly`, or `session` for that folder of the archive; its JSON, with how long it took.
 
     `where` may hold `runner` and `scheduler` (`flows.runners`). `seconds` is the whole duration, `server_seconds` what
-    importing Prefect took until its server answered, `stage_seconds` the stages' own work, summed over the workers.
+    of it went into importing Prefect and into waiting for its server once the night was planned, `stage_seconds` the
+    stages' own work, summed over the workers.
     """
     began = time.monotonic()
     find_source(config, archive)
     prepare(root)
+    named = str(config) if config else None
     with running_server(root) as server:
-        waiting = time.monotonic()
+        starting = time.monotonic()
         from flows.housekeeping import tidy_prefect
-        from flows.nightly import run_nightly
+        from flows.nightly import plan_ahead, run_nightly
 
+        imported = time.monotonic()
+        plan_ahead(archive, root, named, session)
+        waiting = time.monotonic()
         url = server.wait()
-        ready = time.monotonic()
+        start_s = imported - starting + time.monotonic() - waiting
         tidy_prefect(root, url, own_server=server.own)
         what = {"archive": str(archive)} if session is None else {"folder": str(session)}
-        named = {"warehouse": str(root), "config": str(config) if config else None, "workers": workers, **where}
-        result = run_nightly(url, progress, **what, **named)
+        result = run_nightly(url, progress, **what, warehouse=str(root), config=named, workers=workers, **where)
     logs = result.pop("logs")
-    times = {"seconds": round(time.monotonic() - began, 3), "server_seconds": round(ready - waiting, 3)}
+    times = {"seconds": round(time.monotonic() - began, 3), "server_seconds": round(start_s, 3)}
     return {**result, **times, "logs": logs}
 
 

@@ -57,6 +57,7 @@ class Publishing:
 # Prefect walks through the parameters of a task: large things are handed over here, by name, within this process.
 _at_work: dict[str, FlightWork] = {}
 _to_publish: dict[str, Publishing] = {}
+_planned: dict[tuple[Path, Path, str | None, Path | None], tuple[Source, Configuration, Plan]] = {}
 
 
 @task(name="step", task_run_name="{step} {log_uri}", cache_policy=NO_CACHE, persist_result=False)
@@ -152,15 +153,26 @@ def run_nightly(api_url: str, watcher: Watcher | None = None, **parameters: Any)
     return result
 
 
-def _night(root_of_logs: Path, root: Path, config: str | None, only: Path | None, parallel: Parallel) -> dict[str, Any]:
+def plan_ahead(root_of_logs: Path, root: Path, config: str | None, only: Path | None) -> None:
+    """Plan the night that this process is about to run, while its server starts; the flow takes the plan from here."""
+    _planned[(root_of_logs, root, config, only)] = _plan(root_of_logs, root, config, only)
+
+
+def _plan(root_of_logs: Path, root: Path, config: str | None, only: Path | None) -> tuple[Source, Configuration, Plan]:
     source = find_source(Path(config) if config else None, root_of_logs)
     settings = configuration_of(source)
     prepare(root)
     remove_abandoned(root)
+    know_sources(root, keep=True)
+    plan = make_plan(root, root_of_logs, settings, only)
+    write_ledger(root, [*plan.jobs, *plan.copied])
+    return source, settings, plan
+
+
+def _night(root_of_logs: Path, root: Path, config: str | None, only: Path | None, parallel: Parallel) -> dict[str, Any]:
+    ahead = _planned.pop((root_of_logs, root, config, only), None)
+    source, settings, plan = ahead or _plan(root_of_logs, root, config, only)
     with alive(root):
-        know_sources(root, keep=True)
-        plan = make_plan(root, root_of_logs, settings, only)
-        write_ledger(root, [*plan.jobs, *plan.copied])
         tell_plan(len(plan.jobs), len(plan.missing))
         outcomes = [*_from_cache(plan), *_calibrate(root, plan, source, parallel)]
         _publish(root, settings, outcomes)
