@@ -237,10 +237,12 @@ PIPELINE: tuple[Stage, ...] = (
         {
             "imu": "ingest.imu",
             "vps": "ingest.vps",
+            "magnetometer_log": "ingest.magnetometer",
             "attitude": "attitude_pass2.attitude",
             "gyroscope": "gyro_output.calibration",
             "joint": "joint.calibration",
             "joint_attitude": "joint.attitude",
+            "motor_faults": "vectors.faults",
             **FAULTS,
         },
         ("imu",),
