@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fieldcal.errors import EstimationError
-from fieldcal.joint_chain import Joints, Normal, Probe, add_joints, joint_squares, solve_scaled
-from fieldcal.joint_covariance import covariance
+from fieldcal.joint_chain import GRADIENT, SENSORS, Joints, Normal, Probe, add_joints, joint_squares, solve_scaled
+from fieldcal.joint_covariance import covariance, inverse_information
 from fieldcal.joint_model import (
     SENSED,
     Model,
@@ -43,9 +43,11 @@ LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
 MOST_WALK = 10.0
 STIFFENING = 4.0
 LEAST_ACCELERATION_MPS2, LEAST_WALK, LEAST_VARIANCE = 2e-3, 1e-9, 1e-8
+# Bounds of a step of a variance: the translation may vanish, the walk is what ties the attitudes.
+LEAST_RATIO, MOST_RATIO = np.array([0.25, 0.01]), np.array([4.0, 10.0])
 MAX_ITERATIONS = 50
 # Settled: every step below this part of what one could claim as standard deviation, every noise level below it too.
-SETTLED = 0.05
+SETTLED = 0.1
 ROUNDING = 1e-8  # of centred parameters, which are of order one: nothing left to gain
 # Wald test of the lever arm, χ²₃: passed by chance once in a thousand.
 LEVER_ARM_GATE = 16.3
@@ -122,20 +124,39 @@ def fit_joint(model: Model, start: State, *, free_dip: bool = True, try_lever_ar
     with the vehicle other than hard iron.
     """
     free = try_lever_arm and "accelerometer" in model.rows
-    fit = _iterate(model, start, None, dip=free_dip, lever_arm=free)
+    fit, response = _iterate(model, start, None, dip=free_dip, lever_arm=free)
     if not free:
-        return fit
-    own = fit.layout["lever_arm"]
-    arm = fit.state.values["lever_arm"]
-    test = float(arm @ np.linalg.solve(fit.covariance[own, own], arm))
+        return _enlarged(fit, response)
+    test = _lever_arm_test(fit)
+    if test >= LEVER_ARM_GATE:  # colour makes it smaller at most
+        fit = _enlarged(fit, response)
+        test = _lever_arm_test(fit)
     if test < LEVER_ARM_GATE:
-        without = replace(fit.state, values={**fit.state.values, "lever_arm": np.zeros(3)})
-        fit = _iterate(model, without, fit.levels, dip=free_dip, lever_arm=False)
+        own = fit.layout["lever_arm"]
+        none = fit.covariance[:, own] @ np.linalg.solve(fit.covariance[own, own], fit.state.values["lever_arm"])
+        without = fit.state.moved(response @ none, -none, fit.layout)
+        without = replace(without, values={**without.values, "lever_arm": np.zeros(3)})
+        fit = _enlarged(*_iterate(model, without, fit.levels, dip=free_dip, lever_arm=False))
     return replace(fit, lever_arm_test=test)
 
 
-def _iterate(model: Model, state: State, levels: Levels | None, *, dip: bool, lever_arm: bool) -> JointFit:
-    """Gauss–Newton with noise levels renewed at every step."""
+def _lever_arm_test(fit: JointFit) -> float:
+    own, arm = fit.layout["lever_arm"], fit.state.values["lever_arm"]
+    return float(arm @ np.linalg.solve(fit.covariance[own, own], arm))
+
+
+def _enlarged(fit: JointFit, response: Array) -> JointFit:
+    """With the covariance that coloured residuals leave; `response` (K, s, p) of the knots to the parameters."""
+    chunks = sensitivities(fit.model, fit.state, fit.path, fit.layout, len(fit.information))
+    whitening = _whitening(fit.weight, fit.levels)
+    return replace(fit, covariance=covariance(fit.model, chunks, response, fit.information, whitening))
+
+
+def _iterate(
+    model: Model, state: State, levels: Levels | None, *, dip: bool, lever_arm: bool
+) -> tuple[JointFit, Array]:
+    """Gauss–Newton with noise levels renewed at every step: the fit with the inverse information as covariance, and the
+    knots' response N_xx⁻¹N_xθ."""
     layout, p = layout_of(model, dip=dip, lever_arm=lever_arm)
     knots, prior = model.knots, _Prior.at(model, state, layout, p)
     probe = Probe.draw(len(model.at), 3 * len(model.rows), len(knots.index))
@@ -152,32 +173,27 @@ def _iterate(model: Model, state: State, levels: Levels | None, *, dip: bool, le
         gradient[layout["gyroscope"].start + np.arange(3), 0] += _logged_units(model, state, path, levels.walk)
         if "accelerometer" in layout:
             own = layout["accelerometer"].start + np.arange(3)
-            gradient[own, 0] += _integrated_translation(model, state, reaction, eliminated[:, :, p + 1])
+            gradient[own, 0] += _integrated_translation(model, state, reaction, eliminated[:, :, p + SENSORS])
         theta = solve_scaled(information, gradient)
-        step, response = (eliminated[:, :, p + i] - eliminated[:, :, :p] @ theta[:, i] for i in (0, 1))
-        least = _least_part(state, step, theta[:, 0], layout)
-        state = state.moved(least * step, least * theta[:, 0], layout)
+        response = eliminated[:, :, p:] - eliminated[:, :, :p] @ theta
+        step, change = response[:, :, GRADIENT], theta[:, GRADIENT]
+        least = _least_part(state, step, change, layout)
+        state = state.moved(least * step, least * change, layout)
         path = trajectory(model, state)
         residual = residuals(model, state, path)
         if not np.isfinite(residual).all():
             break
-        absorbed = np.einsum("kcr,kc->r", reaction[0], response[:, SENSED]) + reaction[1].T @ theta[:, 1]
+        absorbed = np.einsum("kcr,kc->r", reaction[0], response[:, SENSED, SENSORS]) + reaction[1].T @ theta[:, SENSORS]
         joints = replace(joints, jump=path.jump, motion=state.motion)
-        squares = joint_squares(knots, joints, response, theta[:, 1], probe)
+        squares = joint_squares(knots, joints, response, theta, probe)
         renewed = _levels(model, residual, levels, absorbed, squares, MOST_WALK * gyro_walk(model, state))
-        change, levels = _largest_change(levels, renewed), renewed
+        unsettled, levels = _unsettled(levels, renewed, squares), renewed
         claimed = 1.0 / np.sqrt(np.diagonal(information))
-        largest = float(np.max(np.abs(theta[:, 0])))
-        settled = max(change, float(np.max(np.abs(theta[:, 0]) / claimed))) < SETTLED
-        if settled or largest < ROUNDING:
-            coloured = covariance(
-                model,
-                sensitivities(model, state, path, layout, p),
-                eliminated[:, :, :p],
-                information,
-                _whitening(weight, levels),
-            )
-            return JointFit(model, state, path, levels, weight, layout, coloured, information, iteration)
+        settled = max(unsettled, float(np.max(np.abs(change) / claimed))) < SETTLED
+        if settled or float(np.max(np.abs(change))) < ROUNDING:
+            plain = inverse_information(information)
+            fit = JointFit(model, state, path, levels, weight, layout, plain, information, iteration)
+            return fit, eliminated[:, :, :p]
     raise EstimationError(
         "joint_diverged",
         "The joint estimate found no minimum: the readings contradict each other or the start is too far off.",
@@ -202,7 +218,7 @@ def _normal_equations(
 ) -> tuple[Normal, Array, tuple[Array, Array]]:
     """Those of the sensors; ∂(integrated attitude)/∂θ (K−1, 3, p); and every row's own reaction to the probe."""
     knots, rows = len(model.knots.index), 3 * len(model.rows)
-    normal = Normal.empty(knots, p, 2)
+    normal = Normal.empty(knots, p, 4)
     reaction = np.zeros((knots, len(SENSED), rows)), np.zeros((p, rows))
     moved = np.zeros((knots, 3, p))
     whitening = _whitening(weight, levels)
@@ -268,10 +284,11 @@ def _levels(model: Model, residual: Array, levels: Levels, absorbed: Array, squa
     count = weight.sum(axis=0)
     left = np.maximum(count - levels.colour * absorbed, 0.05 * count)
     variance = np.maximum(np.sum(weight * residual**2, axis=0) / left, LEAST_VARIANCE)
-    square, number, taken = squares.T
-    ratio = np.clip(square / np.maximum(number - taken, 0.02 * number), 0.1, 10.0)
-    # On its way to nothing the translation creeps: more than the plain step there.
-    walk, strength = levels.walk * ratio[0], levels.strength * ratio[1] ** (0.8 if ratio[1] < 1.0 else 0.5)
+    # Upwards the fixed point; downwards halfway to Newton's method, whose steps follow a variance to nothing.
+    square, free, information = np.maximum(squares.T, 1e-9)
+    number = np.where(square < free, np.sqrt(free * np.minimum(information, free)), free)
+    ratio = np.clip(1.0 + (square - free) / number, LEAST_RATIO, MOST_RATIO)
+    walk, strength = levels.walk * ratio[0], levels.strength * np.sqrt(ratio[1])
     return Levels(
         variance,
         _colour(model, residual, weight),
@@ -281,10 +298,13 @@ def _levels(model: Model, residual: Array, levels: Levels, absorbed: Array, squa
     )
 
 
-def _largest_change(before: Levels, after: Levels) -> float:
-    """Largest relative change of a noise variance."""
+def _unsettled(before: Levels, after: Levels, squares: Array) -> float:
+    """Largest relative change of a noise variance; of walk and translation in standard deviations where one could claim
+    less than their own size."""
     old, new = (np.r_[v.variance, v.walk, v.strength**2] for v in (before, after))
-    return float(np.max(np.abs(new / old - 1.0)))
+    change = np.abs(new / old - 1.0)
+    change[-2:] *= np.minimum(1.0, np.sqrt(0.5 * squares[:, 2]))
+    return float(np.max(change))
 
 
 def _robust_weight(model: Model, residual: Array, levels: Levels) -> Array:
