@@ -19,6 +19,7 @@ from fieldcal.joint_chain import GRADIENT, SENSORS, Joints, Normal, Probe, add_j
 from fieldcal.joint_covariance import covariance, inverse_information
 from fieldcal.joint_model import (
     SENSED,
+    TRIADS,
     Model,
     Rows,
     State,
@@ -29,6 +30,7 @@ from fieldcal.joint_model import (
     sensitivities,
     trajectory,
 )
+from fieldcal.joint_vps import VpsRecord
 from fieldcal.rotation import Array, body_from_inertial
 from fieldcal.statistics import robust_sigma, white_noise_sigma
 
@@ -85,6 +87,7 @@ class JointFit:
     information: Array
     iterations: int
     lever_arm_test: float | None = None
+    vps: VpsRecord | None = None
 
     def constants(self, name: str) -> tuple[Array, Array, Array]:
         """(λ (3,), b (3,), covariance (6, 6)) of a triad in logged units."""
@@ -93,7 +96,15 @@ class JointFit:
         return value[:3], value[3:], transform @ self.covariance[own, own] @ transform.T
 
 
-def fit_joint(model: Model, start: State, *, free_dip: bool = True, try_lever_arm: bool = True) -> JointFit:
+def fit_joint(
+    model: Model,
+    start: State,
+    *,
+    free_dip: bool = True,
+    try_lever_arm: bool = True,
+    vps: VpsRecord | None = None,
+    levels: Levels | None = None,
+) -> JointFit:
     """Estimate everything from a start within some tens of per cent.
 
     Parameters
@@ -102,12 +113,16 @@ def fit_joint(model: Model, start: State, *, free_dip: bool = True, try_lever_ar
         The record, knots placed.
     start : State
         Attitudes of the knots within about 30°, constants with the right polarity. Its lever arm is kept unless
-        `try_lever_arm`.
+        `try_lever_arm`. Optional terms (`joint_model.OPTIONAL`) that it has a value for are estimated too.
     free_dip : bool
         Estimate the dip angle; otherwise that of the configured field holds.
     try_lever_arm : bool
         Estimate the lever arm, and keep it only where it differs from none (Wald test): estimating it on data that do
         not show it costs accuracy.
+    vps : VpsRecord, optional
+        Reference attitudes; `start` then holds `VpsRecord.start()` too.
+    levels : Levels, optional
+        Noise to start from, that of a fit nearby.
 
     Raises
     ------
@@ -124,7 +139,7 @@ def fit_joint(model: Model, start: State, *, free_dip: bool = True, try_lever_ar
     with the vehicle other than hard iron.
     """
     free = try_lever_arm and "accelerometer" in model.rows
-    fit, response = _iterate(model, start, None, dip=free_dip, lever_arm=free)
+    fit, response = _iterate(model, start, levels, dip=free_dip, lever_arm=free, vps=vps)
     if not free:
         return _enlarged(fit, response)
     test = _lever_arm_test(fit)
@@ -136,7 +151,7 @@ def fit_joint(model: Model, start: State, *, free_dip: bool = True, try_lever_ar
         none = fit.covariance[:, own] @ np.linalg.solve(fit.covariance[own, own], fit.state.values["lever_arm"])
         without = fit.state.moved(response @ none, -none, fit.layout)
         without = replace(without, values={**without.values, "lever_arm": np.zeros(3)})
-        fit = _enlarged(*_iterate(model, without, fit.levels, dip=free_dip, lever_arm=False))
+        fit = _enlarged(*_iterate(model, without, fit.levels, dip=free_dip, lever_arm=False, vps=vps))
     return replace(fit, lever_arm_test=test)
 
 
@@ -149,15 +164,16 @@ def _enlarged(fit: JointFit, response: Array) -> JointFit:
     """With the covariance that coloured residuals leave; `response` (K, s, p) of the knots to the parameters."""
     chunks = sensitivities(fit.model, fit.state, fit.path, fit.layout, len(fit.information))
     whitening = _whitening(fit.weight, fit.levels)
-    return replace(fit, covariance=covariance(fit.model, chunks, response, fit.information, whitening))
+    poses = None if fit.vps is None else fit.vps.whitened(fit.model, fit.state, fit.path, fit.layout, response)
+    return replace(fit, covariance=covariance(fit.model, chunks, response, fit.information, whitening, poses))
 
 
 def _iterate(
-    model: Model, state: State, levels: Levels | None, *, dip: bool, lever_arm: bool
+    model: Model, state: State, levels: Levels | None, *, dip: bool, lever_arm: bool, vps: VpsRecord | None
 ) -> tuple[JointFit, Array]:
     """Gauss–Newton with noise levels renewed at every step: the fit with the inverse information as covariance, and the
     knots' response N_xx⁻¹N_xθ."""
-    layout, p = layout_of(model, dip=dip, lever_arm=lever_arm)
+    layout, p = layout_of(model, state.values, dip=dip, lever_arm=lever_arm)
     knots, prior = model.knots, _Prior.at(model, state, layout, p)
     probe = Probe.draw(len(model.at), 3 * len(model.rows), len(knots.index))
     path = trajectory(model, state)
@@ -168,6 +184,8 @@ def _iterate(
         normal, moved, reaction = _normal_equations(model, state, path, layout, p, weight, levels, probe)
         joints = Joints(path.jump, moved, levels.walk, state.motion, levels.strength)
         add_joints(normal, knots, joints, probe)
+        if vps is not None:
+            vps.add(normal, model, state, path, layout)
         prior.add(normal, state, layout)
         eliminated, information, gradient = normal.eliminate()
         gradient[layout["gyroscope"].start + np.arange(3), 0] += _logged_units(model, state, path, levels.walk)
@@ -192,7 +210,7 @@ def _iterate(
         settled = max(unsettled, float(np.max(np.abs(change) / claimed))) < SETTLED
         if settled or float(np.max(np.abs(change))) < ROUNDING:
             plain = inverse_information(information)
-            fit = JointFit(model, state, path, levels, weight, layout, plain, information, iteration)
+            fit = JointFit(model, state, path, levels, weight, layout, plain, information, iteration, vps=vps)
             return fit, eliminated[:, :, :p]
     raise EstimationError(
         "joint_diverged",
@@ -257,7 +275,7 @@ def _least_part(state: State, step: Array, theta: Array, layout: Mapping[str, sl
     """Part of a step that may be taken: no attitude by more than LARGEST_TURN_RAD, no scale by LARGEST_RELATIVE."""
     longest = [float(np.max(np.abs(step[:, :3]))) / LARGEST_TURN_RAD]
     for name, own in layout.items():
-        if own.stop - own.start == 6:
+        if name in TRIADS:
             scale = np.abs(state.values[name][:3])
             longest.append(float(np.max(np.abs(theta[own].reshape(2, 3)) / scale)) / LARGEST_RELATIVE)
     return 1.0 / max(1.0, *longest)

@@ -27,6 +27,8 @@ ACCELERATION = slice(3, 6)  # of a knot's translation
 SENSED = np.array([0, 1, 2, 6, 7, 8])  # of a knot's states: attitude and acceleration
 BLOCKS = ((slice(0, 3), slice(0, 3)), (slice(6, 9), slice(3, 6)))  # the same by slices: of the states, of SENSED
 TRIADS = ("gyroscope", "accelerometer", "magnetometer")
+# What a start may hold beside constants, and how many numbers that is (`joint_vps`).
+OPTIONAL = {"vps_clock": 2, "vps_world": 3, "vps_body": 3}
 
 
 @dataclass(frozen=True)
@@ -379,16 +381,19 @@ def sums_by_interval(model: Model, x: Array, own: slice, ties: slice) -> Array:
     return np.asarray(sums)
 
 
-def layout_of(model: Model, *, dip: bool, lever_arm: bool) -> tuple[dict[str, slice], int]:
-    """Where each free parameter stands in θ, and how many there are."""
+def layout_of(
+    model: Model, values: Mapping[str, Array], *, dip: bool, lever_arm: bool
+) -> tuple[dict[str, slice], int]:
+    """Where each free parameter stands in θ, and how many there are: optional terms where `values` has them."""
     layout, at = {}, 0
     free = ["gyroscope", *model.rows]
     if dip and len(model.rows) == 2:
         free.append("dip")
     if lever_arm and "accelerometer" in model.rows:
         free.append("lever_arm")
+    free += [name for name in OPTIONAL if name in values]
     for name in free:
-        size = {"dip": 1, "lever_arm": 3}.get(name, 6)
+        size = {"dip": 1, "lever_arm": 3, **OPTIONAL}.get(name, 6)
         layout[name] = slice(at, at + size)
         at += size
     return layout, at

@@ -46,6 +46,7 @@ AXES = ("rotation_body_from_sensor", "body")
 SMOOTHING = ("smoothing_cutoff_hz", "smoothing_ends", "smoothing_side_s")
 VECTORS = ("attitude", "field_ned", "gravity_mps2", "gravity_sign", "nominal_scale", "polarity", "units", *AXES)
 GYRO = ("gyro_max_scale_sd", "nominal_scale", "polarity", "units", "reference_reading", *AXES)
+VPS = ("world", "vps_max_lag_s", "vps_min_peak", "vps_max_gap_s")
 FAULTS = {"faults": "sanity.faults"}
 SAMPLES = {"samples": "smoothing.samples", "temperature": "ingest.temperature", **FAULTS}
 MAGNETOMETER = {"magnetometer": "magnetometer.calibration", "magnetometer_covariance": "magnetometer.covariance"}
@@ -206,6 +207,7 @@ PIPELINE: tuple[Stage, ...] = (
         {
             **SAMPLES,
             "imu": "ingest.imu",
+            "vps": "ingest.vps",
             "magnetometer_log": "ingest.magnetometer",
             "magnetometer": "magnetometer.calibration",
             "accelerometer": "accelerometer_pass2.calibration",
@@ -229,6 +231,8 @@ PIPELINE: tuple[Stage, ...] = (
             "ellipsoid_max_scale_sd",
             "ellipsoid_max_residual",
             "gyro_max_scale_sd",
+            "use_vps",
+            *VPS,
         ),
     ),
     Stage(
@@ -247,7 +251,7 @@ PIPELINE: tuple[Stage, ...] = (
         },
         ("imu",),
         ("sync", "vps_aligned"),
-        (*AXES, "world", "polarity", "nominal_scale", "vps_max_lag_s", "vps_min_peak", "vps_max_gap_s"),
+        (*AXES, "polarity", "nominal_scale", *VPS),
         ("gyroscope",),
     ),
     Stage(
