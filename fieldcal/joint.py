@@ -277,7 +277,7 @@ def _least_part(state: State, step: Array, theta: Array, layout: Mapping[str, sl
     for name, own in layout.items():
         if name in TRIADS:
             scale = np.abs(state.values[name][:3])
-            longest.append(float(np.max(np.abs(theta[own].reshape(2, 3)) / scale)) / LARGEST_RELATIVE)
+            longest.append(float(np.max(np.abs(theta[own][:3]) / scale)) / LARGEST_RELATIVE)
     return 1.0 / max(1.0, *longest)
 
 
@@ -287,7 +287,11 @@ def _first_levels(model: Model, state: State, path: Trajectory, residual: Array)
     variance = np.maximum(sigma**2, LEAST_VARIANCE)
     jumped = np.sum(path.jump**2) / (3.0 * np.sum(model.knots.interval_s * model.knots.joined))
     walk = max(WALK_START * gyro_walk(model, state), float(jumped), LEAST_WALK)
-    return Levels(variance, np.ones(len(variance)), walk, ACCELERATION_START_MPS2)
+    strength = ACCELERATION_START_MPS2
+    if "accelerometer" in model.rows:
+        row = 3 * model.rows.index("accelerometer")
+        strength = max(strength, float(np.max(sigma[row : row + 3] * np.abs(state.values["accelerometer"][:3]))))
+    return Levels(variance, np.ones(len(variance)), walk, strength)
 
 
 def gyro_walk(model: Model, state: State) -> float:
