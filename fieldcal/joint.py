@@ -17,19 +17,8 @@ import numpy as np
 from fieldcal.errors import EstimationError
 from fieldcal.joint_chain import GRADIENT, SENSORS, Joints, Normal, Probe, add_joints, joint_squares, solve_scaled
 from fieldcal.joint_covariance import covariance, inverse_information
-from fieldcal.joint_model import (
-    SENSED,
-    TRIADS,
-    Model,
-    Rows,
-    State,
-    Trajectory,
-    accumulate,
-    layout_of,
-    residuals,
-    sensitivities,
-    trajectory,
-)
+from fieldcal.joint_model import SENSED, Rows, Trajectory, accumulate, layout_of, residuals, sensitivities, trajectory
+from fieldcal.joint_record import CROSS, TRIADS, Model, State, off_diagonal
 from fieldcal.joint_vps import VpsRecord
 from fieldcal.rotation import Array, body_from_inertial
 from fieldcal.statistics import robust_sigma, white_noise_sigma
@@ -90,10 +79,26 @@ class JointFit:
     vps: VpsRecord | None = None
 
     def constants(self, name: str) -> tuple[Array, Array, Array]:
-        """(λ (3,), b (3,), covariance (6, 6)) of a triad in logged units."""
+        """(λ (3,), b (3,), covariance (6, 6)) of a triad without cross-axis terms, logged units."""
         transform = self.model.triads[name].to_logged()
         value, own = transform @ self.state.values[name], self.layout[name]
         return value[:3], value[3:], transform @ self.covariance[own, own] @ transform.T
+
+    def full_constants(self, name: str) -> tuple[Array, Array, Array]:
+        """(Λ (3, 3), b (3,), covariance (12, 12) of Λ by rows and b) of a triad with cross-axis terms, logged units."""
+        triad, own, scaled = self.model.triads[name], self.layout[name], self.state.values[name]
+        cross = f"{name}_cross"
+        e = off_diagonal(name, self.state.values[cross]) if cross in self.layout else np.zeros((3, 3))
+        matrix = scaled[:3, None] * (np.eye(3) + e) / triad.spread
+        jacobian = np.zeros((12, len(self.covariance)))
+        for i in range(3):
+            jacobian[3 * i : 3 * i + 3, own.start + i] = matrix[i] / scaled[i]
+            jacobian[9 + i, own.start + 3 + i] = 1.0
+        if cross in self.layout:
+            for k, (i, j) in enumerate(CROSS[name]):
+                jacobian[3 * i + j, self.layout[cross].start + k] = scaled[i] / triad.spread[j]
+        jacobian[9:] -= np.einsum("ijp,j->ip", jacobian[:9].reshape(3, 3, -1), triad.centre)
+        return matrix, scaled[3:] - matrix @ triad.centre, jacobian @ self.covariance @ jacobian.T
 
 
 def fit_joint(
@@ -180,12 +185,8 @@ def _iterate(
     residual = residuals(model, state, path)
     levels = levels or _first_levels(model, state, path, residual)
     for iteration in range(1, MAX_ITERATIONS + 1):
-        weight = _robust_weight(model, residual, levels)
-        normal, moved, reaction = _normal_equations(model, state, path, layout, p, weight, levels, probe)
-        joints = Joints(path.jump, moved, levels.walk, state.motion, levels.strength)
-        add_joints(normal, knots, joints, probe)
-        if vps is not None:
-            vps.add(normal, model, state, path, layout)
+        weight = robust_weight(model, residual, levels)
+        normal, joints, reaction = linearised(model, state, path, layout, p, weight, levels, probe, vps)
         prior.add(normal, state, layout)
         eliminated, information, gradient = normal.eliminate()
         gradient[layout["gyroscope"].start + np.arange(3), 0] += _logged_units(model, state, path, levels.walk)
@@ -217,6 +218,26 @@ def _iterate(
         "The joint estimate found no minimum: the readings contradict each other or the start is too far off.",
         {"iterations": iteration},
     )
+
+
+def linearised(
+    model: Model,
+    state: State,
+    path: Trajectory,
+    layout: Mapping[str, slice],
+    p: int,
+    weight: Array,
+    levels: Levels,
+    probe: Probe,
+    vps: VpsRecord | None,
+) -> tuple[Normal, Joints, tuple[Array, Array]]:
+    """Normal equations of everything but the prior, the joints in them, and every row's own reaction to the probe."""
+    normal, moved, reaction = _normal_equations(model, state, path, layout, p, weight, levels, probe)
+    joints = Joints(path.jump, moved, levels.walk, state.motion, levels.strength)
+    add_joints(normal, model.knots, joints, probe)
+    if vps is not None:
+        vps.add(normal, model, state, path, layout)
+    return normal, joints, reaction
 
 
 def _whitening(weight: Array, levels: Levels) -> Array:
@@ -302,7 +323,7 @@ def gyro_walk(model: Model, state: State) -> float:
 
 def _levels(model: Model, residual: Array, levels: Levels, absorbed: Array, squares: Array, most_walk: float) -> Levels:
     """Variance components: squares over what the unknowns leave of their number."""
-    weight = _robust_weight(model, residual, levels)
+    weight = robust_weight(model, residual, levels)
     count = weight.sum(axis=0)
     left = np.maximum(count - levels.colour * absorbed, 0.05 * count)
     variance = np.maximum(np.sum(weight * residual**2, axis=0) / left, LEAST_VARIANCE)
@@ -329,7 +350,7 @@ def _unsettled(before: Levels, after: Levels, squares: Array) -> float:
     return float(np.max(change))
 
 
-def _robust_weight(model: Model, residual: Array, levels: Levels) -> Array:
+def robust_weight(model: Model, residual: Array, levels: Levels) -> Array:
     """Redescending weights (m, r): 1 up to CLIP standard deviations of the reading, (CLIP/d)² beyond, 0 for none."""
     out = np.empty_like(residual)
     for i, name in enumerate(model.rows):

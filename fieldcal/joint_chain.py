@@ -221,6 +221,14 @@ def _add_motion(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> N
         normal.right[:, 3:, p + column] += right.reshape(-1, 3 * ORDER)
 
 
+def whitened_joints(knots: Knots, joints: Joints) -> Array:
+    """Each interval's attitude jump and the translation's process noise in it, over their sd, (K−1, 3 + 9)."""
+    ahead, behind, _ = _process(knots, joints.strength)
+    y = joints.motion.reshape(-1, ORDER, 3)
+    jump = joints.jump * np.sqrt(knots.joined / (joints.walk * knots.interval_s))[:, None]
+    return np.hstack([jump, (ahead @ y[1:] - behind @ y[:-1]).reshape(len(jump), -1)])
+
+
 def joint_squares(knots: Knots, joints: Joints, state: Array, theta: Array, probe: Probe) -> Array:
     """(2, 3): for attitude jumps and for the translation, the whitened squares s, how many of them are free e = tr M,
     and tr M² for M = I − (what the unknowns absorb). ½(s − e) and ½ tr M² are score and information of the logarithm

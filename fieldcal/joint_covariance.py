@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from fieldcal.joint_model import SENSED, Model, Rows, State, sums_by_interval
+from fieldcal.joint_model import SENSED, Rows, sums_by_interval
+from fieldcal.joint_record import Model, State
 from fieldcal.rotation import Array
 from fieldcal.statistics import coloured_information
 

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fieldcal.joint_chain import GRADIENT, Normal
-from fieldcal.joint_model import OPTIONAL, Model, State, Trajectory
+from fieldcal.joint_model import Trajectory
+from fieldcal.joint_record import OPTIONAL, Model, State
 from fieldcal.rotation import (
     Array,
     body_from_inertial,
@@ -86,6 +87,10 @@ class VpsRecord:
         score = np.r_[0.0, np.where(suspect, length, 0.0), 0.0]
         bad[1:-1] = suspect & (score[1:-1] >= score[:-2]) & (score[1:-1] >= score[2:])
         return bad
+
+    def at_knots(self, model: Model, state: State, path: Trajectory) -> VpsRecord | None:
+        """The same record for the knots of another model: its start's clock and mounting are this one's."""
+        return VpsRecord.of(self.t, self.q, self.clock, model, state, path, max_gap_s=self.max_gap_s)
 
     def start(self) -> dict[str, Array]:
         """Values of a start: corrections to `clock`, `world` and `body`."""
