@@ -11,7 +11,7 @@ import polars as pl
 from fieldcal import drift, fleet
 from fieldcal.histories import ENOUGH_SESSIONS, Histories
 from flows.ask import existing
-from flows.drift_reasons import reason
+from flows.drift_reasons import AGREEMENT, VPS, reason
 from flows.drift_warm_up import known_slopes
 from schemas import TABLES
 from warehouse import Warehouse
@@ -22,8 +22,6 @@ from warehouse.store import empty_frame, read_table
 KEY = ["imu_id", "sensor", "method", "parameter", "axis"]
 SIGNED = ("scale", "bias", "zero_bias")
 """Parameters whose sign follows the polarity of the axis: siblings may be mounted the other way round."""
-VPS, AGREEMENT = "vps", "fit"
-"""What stands as `sensor` of rows about the VPS clock and about agreement (Theil's coefficients)."""
 DAY_US = 86_400_000_000
 ATTEMPTS = 10
 
