@@ -80,10 +80,17 @@ def _task_runner(parallel: Parallel) -> TaskRunner[Any]:
     if parallel.runner == "process":
         from prefect.task_runners import ProcessPoolTaskRunner
 
-        return ProcessPoolTaskRunner(max_workers=parallel.workers)
+        return ProcessPoolTaskRunner(max_workers=parallel.workers, initializer=tell_server_directly)
     if parallel.runner == "dask":
         return _dask(parallel)
     raise FieldcalError("wrong_option", f"runner must be one of {', '.join(RUNNERS)}, not {parallel.runner!r}.")
+
+
+def tell_server_directly() -> None:
+    """In a process of the pool: send its events to the server itself, not through the process that planned the night."""
+    from prefect.events.worker import EventsWorker
+
+    EventsWorker.set_client_override(None)
 
 
 def _dask(parallel: Parallel) -> TaskRunner[Any]:
