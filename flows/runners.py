@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 RUNNERS = ("process", "dask", "pool")
 LARGEST_BATCH = 40
-SMALLEST_BATCH = 4
+SMALLEST_BATCH = 2
 SHARE_OF_A_WORKER = 4
 LISTEN_S = 0.25
 
@@ -94,6 +94,7 @@ def process_answers(workers: int, run: Callable[..., dict[str, Any]], inputs: Se
             # A wait without end would not hear Ctrl-C.
             for future in wait(waiting, LISTEN_S, FIRST_COMPLETED).done:
                 yield waiting.pop(future), _answer(future)
+        pool.shutdown(wait=False)  # they tell Prefect the rest while the night publishes
 
 
 def _processes(workers: int) -> ProcessPoolExecutor:
