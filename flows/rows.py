@@ -30,12 +30,12 @@ FACTS = (
 )
 LEAD_SCHEMA = pl.Schema(
     {
-        "flight_id": pl.String,
-        "vehicle_id": pl.String,
-        "imu_id": pl.String,
-        "session_id": pl.String,
+        "flight_id": pl.String(),
+        "vehicle_id": pl.String(),
+        "imu_id": pl.String(),
+        "session_id": pl.String(),
         "started_at": pl.Datetime("us", "UTC"),
-        "run_key": pl.String,
+        "run_key": pl.String(),
     }
 )
 StageTables = Mapping[str, tuple[pl.DataFrame, str | None]]
