@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from fieldcal.change_points import scatter_variance, strongest_step, temperature_slope
 from fieldcal.fleet import LEAST_FREEDOM, moderated_variance
@@ -41,9 +41,10 @@ FALSE_ALARMS = 0.01
 FALSE_OUTLIERS = 0.05
 """The same for outliers among siblings, which claim less: nothing has changed."""
 MOST_STEPS = 3
-NO_TREND_SIGMAS = 2.0
-"""A step's size is taken without a slope in time when that slope is not beyond this: the two tell the same story twice,
-and a slope that is not there would double the size's sd."""
+STEPS_THAT_DRIFT = 0.05
+"""Share of stepping units that are taken to drift as well, before their record is looked at. A slope in time and a step
+tell much the same story: a slope that is not there would double the sd of the step's size, one that is there and left
+out would shift it."""
 LEAST_LEFT = 0.05
 """Share of a flight's variance that is left to it, at least, however much it draws the line to itself."""
 
@@ -227,7 +228,7 @@ def _told(h: Histories, p: Prepared, design: Array, fit: Regression, steps: np.n
     single = np.sqrt(p.mean_variance + fit.session_variance + fit.flight_variance)
     time, g = p.keep * design[:, TIME], len(p.unit)
     span = largest(h.row, time, g) + largest(h.row, -time, g)
-    change_day, size, size_sd = _latest_step(h, p, design, drift_z, steps)
+    change_day, size, size_sd = _latest_step(h, p, design, steps)
 
     def only(mask: np.ndarray, x: Array) -> Array:
         return np.where(mask, x, np.nan)
@@ -273,25 +274,38 @@ def _last_distance(p: Prepared, design: Array, fit: Regression) -> Array:
     return np.asarray(error / np.sqrt(spread))
 
 
-def _latest_step(
-    h: Histories, p: Prepared, design: Array, drift_z: Array, steps: np.ndarray
-) -> tuple[Array, Array, Array]:
-    """(time of the first flight, size, sd) of the latest step of each row; NaN without one."""
+def _latest_step(h: Histories, p: Prepared, design: Array, steps: np.ndarray) -> tuple[Array, Array, Array]:
+    """(time of the first flight, size, sd) of the latest step of each row; NaN without one.
+
+    The size is the mean of two models', with a slope in time and without, by their posterior probability: BIC's
+    approximation to the odds of the slope, times the prior ones (`STEPS_THAT_DRIFT`). Its variance holds the models'
+    disagreement. Hoeting et al. (1999), Statistical Science 14, 382–417.
+    """
     grouping, g = p.grouping, len(p.unit)
     latest, found = steps.argmax(axis=1), steps.max(axis=1) >= 0
     day, size, size_sd = np.full(g, np.nan), np.full(g, np.nan), np.full(g, np.nan)
     if not found.any():
         return day, size, size_sd
-    without = design.copy()
-    without[(found & ~(np.abs(drift_z) > NO_TREND_SIGMAS))[grouping.row], TIME] = 0.0
     members = np.flatnonzero(found[grouping.row])
     rows, row = np.unique(grouping.row[members], return_inverse=True)
     sessions, session = np.unique(grouping.session[members], return_inverse=True)
     part = Grouping(row, session, np.searchsorted(rows, grouping.row_of_session[sessions]), len(rows))
-    fit = fit_random_effects(part, without[members], p.y[members], p.variance[members], p.keep[members])
+    data = p.y[members], p.variance[members], p.keep[members]
+    sloped = fit_random_effects(part, design[members], *data)
+    plain = fit_random_effects(part, np.where(np.arange(design.shape[1]) == TIME, 0.0, design[members]), *data)
     own, column = np.arange(len(rows)), TIME + 1 + latest[rows]
-    size[rows] = p.unit[rows] * fit.coefficients[own, column]
-    size_sd[rows] = p.unit[rows] * np.sqrt(fit.covariance[own, column, column])
+    t2 = sloped.coefficients[:, TIME] ** 2 / np.maximum(sloped.covariance[:, TIME, TIME], 1e-300)
+    n, freedom = p.n_sessions[rows], np.maximum(sloped.freedom, 1.0)
+    log_odds = 0.5 * (n * np.log1p(t2 / freedom) - np.log(n)) + special.logit(STEPS_THAT_DRIFT)
+    drifts = np.where(sloped.active[:, TIME], special.expit(log_odds), 0.0)
+    with_slope, without = sloped.coefficients[own, column], plain.coefficients[own, column]
+    mean = drifts * with_slope + (1.0 - drifts) * without
+    variance = (
+        drifts * sloped.covariance[own, column, column]
+        + (1.0 - drifts) * plain.covariance[own, column, column]
+        + drifts * (1.0 - drifts) * (with_slope - without) ** 2
+    )
+    size[rows], size_sd[rows] = p.unit[rows] * mean, p.unit[rows] * np.sqrt(variance)
     first = np.full(len(grouping.row_of_session), len(h.row))
     index = np.flatnonzero(p.keep)
     np.minimum.at(first, grouping.session[index], index)
