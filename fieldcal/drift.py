@@ -106,21 +106,29 @@ def analyse(h: Histories) -> Trends:
     return _told(h, p, design, fit, steps, step_p)
 
 
+def moving(trends: Trends) -> tuple[np.ndarray, np.ndarray]:
+    """(stepped, drifting), each (g,). Drifting takes more than significance: over its record the parameter has moved by
+    more than one flight scatters."""
+    enough = trends.n_sessions >= ENOUGH_SESSIONS
+    drifting = np.zeros(len(enough), dtype=bool)
+    drifting[enough] = alarms(trends.drift_p[enough])
+    return enough & np.isfinite(trends.change_size), enough & drifting & (trends.moved > 1.0)
+
+
 def statuses(trends: Trends, fleet_p: Array) -> np.ndarray:
     """`insufficient`, `step`, `drifting`, `outlier` or `stable` for each row, the first that applies.
 
-    `fleet_p` (g,): chance of such a distance from the siblings (`fleet.sibling_distance`). Drifting takes more than
-    significance: over its record the parameter has moved by more than one flight scatters.
+    `fleet_p` (g,): chance of such a distance from the siblings (`fleet.sibling_distance`).
     """
     enough = trends.n_sessions >= ENOUGH_SESSIONS
     status = np.full(len(enough), "insufficient", dtype=object)
-    drifting, outlier = np.zeros(len(enough), dtype=bool), np.zeros(len(enough), dtype=bool)
-    drifting[enough] = alarms(trends.drift_p[enough])
+    outlier = np.zeros(len(enough), dtype=bool)
     outlier[enough] = alarms(fleet_p[enough], FALSE_OUTLIERS)
+    stepped, drifting = moving(trends)
     status[enough] = "stable"
     status[enough & outlier] = "outlier"
-    status[enough & drifting & (trends.moved > 1.0)] = "drifting"
-    status[enough & np.isfinite(trends.change_size)] = "step"
+    status[drifting] = "drifting"
+    status[stepped] = "step"
     return status
 
 

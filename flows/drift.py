@@ -61,8 +61,9 @@ def table_of(flights: pl.DataFrame) -> pl.DataFrame:
     if flights.is_empty():
         return empty_frame("drift")
     rows, trends = trends_of(flights)
-    group, value, sd = _siblings(rows, trends)
-    fleet_z, fleet_p = fleet.sibling_distance(group, value, sd)
+    group, kind, value, sd = _siblings(rows, trends)
+    stepped, drifting = drift.moving(trends)
+    fleet_z, fleet_p = fleet.sibling_distance(group, value, sd, doubtful=stepped | drifting, kind=kind)
     result = rows.with_columns(
         **{
             name: pl.Series(np.asarray(column, dtype=float), nan_to_null=True)
@@ -164,8 +165,9 @@ def trends_of(flights: pl.DataFrame) -> tuple[pl.DataFrame, drift.Trends]:
     return rows.join(last, on="row", how="left", maintain_order="left"), trends
 
 
-def _siblings(rows: pl.DataFrame, trends: drift.Trends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(group (g,), value, sd) that siblings are compared by. Too short histories are groups of their own.
+def _siblings(rows: pl.DataFrame, trends: drift.Trends) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(group (g,), kind, value, sd) that siblings are compared by. Too short histories are groups of their own; groups
+    that differ in the axis alone are of a kind.
 
     A VPS clock's lag is arbitrary, its scatter from session to session is not: there the logarithm of the scatter."""
     value, sd = trends.value.copy(), trends.sd.copy()
@@ -183,8 +185,11 @@ def _siblings(rows: pl.DataFrame, trends: drift.Trends) -> tuple[np.ndarray, np.
     group = rows.select(pl.struct("sensor", "method", "parameter", "axis", "unit").rank("dense")).to_series().to_numpy()
     group = group.astype(np.int64)
     alone = (trends.n_sessions < ENOUGH_SESSIONS) | ~np.isfinite(value) | ~np.isfinite(sd)
-    group[alone] = group.max() + 1 + np.arange(alone.sum())
-    return group, np.where(alone, 0.0, value), np.where(alone, 1.0, sd)
+    kind = rows.select(pl.struct("sensor", "method", "parameter", "unit").rank("dense")).to_series().to_numpy()
+    kind = kind.astype(np.int64)
+    for label in (group, kind):
+        label[alone] = label.max() + 1 + np.arange(alone.sum())
+    return group, kind, np.where(alone, 0.0, value), np.where(alone, 1.0, sd)
 
 
 def _moments(day: np.ndarray) -> pl.Series:
