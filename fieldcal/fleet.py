@@ -7,7 +7,7 @@ from scipy import special, stats
 
 from fieldcal.rotation import Array
 
-LEAST_SIBLINGS = 3
+LEAST_SIBLINGS = 2
 """Others that a value is measured against, at least."""
 ENOUGH_SIBLINGS = 5
 """Others that it takes to look for outliers among them, or to let siblings lend their scatter."""
@@ -32,7 +32,7 @@ def sibling_distance(
     siblings are. s̃² is the others' variance s², of k − 1 degrees of freedom, drawn towards that of the other groups of
     its kind, which count for `LIKE_FREEDOM` degrees at most: in a fleet of five the spread of one axis is next to
     unknown. The p-value is that of one comparison: many are made, which is the caller's to count. NaN and p = 1 with
-    fewer than three others.
+    fewer than two others.
 
     Parameters
     ----------
