@@ -55,6 +55,7 @@ class Trends:
 
     `n_flights`, `n_sessions`: that count; `value`, `sd`: at 25 °C as of the last flight that counts; `best_degc`:
     temperature at which the value is independent of the slope, so that var(T) = var(best) + slope_sd² (T − best)²;
+    `best_day`: the same of the slope in time, at 25 °C;
     `session_sd`, `flight_sd`: scatter between sessions and, beyond their claims, of flights within them; `last_z`: the
     last flight's distance from the line drawn without it, in sd; `change_day`, `change_size`: first flight after the
     latest step, and the step; `drift_p`, `step_p`: chance of such a slope in time, such a step, in a stable unit.
@@ -70,6 +71,7 @@ class Trends:
     slope_per_day: Array
     slope_per_day_sd: Array
     best_degc: Array
+    best_day: Array
     session_sd: Array
     flight_sd: Array
     last_z: Array
@@ -230,7 +232,10 @@ def _told(h: Histories, p: Prepared, design: Array, fit: Regression, steps: np.n
     sd = p.unit * np.sqrt(np.maximum(np.einsum("gp,gp->g", direction, with_all), 0.0))
     with np.errstate(invalid="ignore", divide="ignore"):
         drift_z = fit.coefficients[:, TIME] / np.sqrt(fit.covariance[:, TIME, TIME])
-        to_best = with_all[:, TEMPERATURE] / fit.covariance[:, TEMPERATURE, TEMPERATURE] * p.x_width[:, TEMPERATURE]
+        to_best, earlier = (
+            with_all[:, column] / fit.covariance[:, column, column] * p.x_width[:, column]
+            for column in (TEMPERATURE, TIME)
+        )
     freedom = np.maximum(fit.freedom, LEAST_FREEDOM)
     drift_p = np.where(timed & (fit.freedom > LEAST_FREEDOM), 2.0 * stats.t.sf(np.abs(drift_z), freedom), np.nan)
     single = np.sqrt(p.mean_variance + fit.session_variance + fit.flight_variance)
@@ -257,6 +262,7 @@ def _told(h: Histories, p: Prepared, design: Array, fit: Regression, steps: np.n
         slope_per_day=per_day,
         slope_per_day_sd=per_day_sd,
         best_degc=np.where(warm, REFERENCE_DEGC - to_best, p.x_centre[:, TEMPERATURE]),
+        best_day=only(there & fit.active[:, TIME], h.time_day[np.maximum(last, 0)] - earlier),
         session_sd=only(several, p.unit * np.sqrt(fit.session_variance)),
         flight_sd=only(several, p.unit * np.sqrt(fit.flight_variance)),
         last_z=only(p.enough & p.timed, _last_distance(p, design, fit)),
