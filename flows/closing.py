@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from fieldcal.configuration import Alerts
 from flows.drift_changes import Change, changes, last_usable
 from flows.steps import code_digest
 from warehouse import Warehouse
@@ -30,7 +31,7 @@ class Closing:
     report: Path | None = None
 
 
-def close_night(root: Path) -> Closing:
+def close_night(root: Path, alerts: Alerts) -> Closing:
     """Bring trends and reports up to the history; what is to be told tonight that was not told before.
 
     Trends are regressed only where the history, or the code that makes them, is another than last time. Reports: the
@@ -51,9 +52,12 @@ def close_night(root: Path) -> Closing:
 
             update_drift(root)
         table = Warehouse(root).scan("drift").collect()
-        since = datetime.fromisoformat(before["at"]) if "at" in before else None
-        told = changes(former, table, last_usable(root), now=now, since=since)
-        record = {"at": now.isoformat(), "made_from": made_from, "made": history_digest(root, ["drift"])}
+        # With other limits than last time, what they make old is told whenever it passed them.
+        limits = asdict(alerts)
+        since = datetime.fromisoformat(before["at"]) if before.get("alerts") == limits else None
+        told = changes(former, table, last_usable(root), now=now, since=since, alerts=alerts)
+        made = history_digest(root, ["drift"])
+        record = {"at": now.isoformat(), "made_from": made_from, "made": made, "alerts": limits}
         write_bytes(_place(root), seal(record), durable=False)
         return Closing(told, _reports(root, told))
 

@@ -200,7 +200,7 @@ def _night(root_of_logs: Path, root: Path, config: str | None, only: Path | None
         tell_plan(len(plan.jobs), len(plan.missing))
         outcomes = [*_from_cache(plan), *_calibrate(root, plan, source, parallel)]
         _publish(root, settings, outcomes)
-        closing = close_night(root)
+        closing = close_night(root, settings.alerts)
         told = [change.row() for change in closing.changes]
         result = {**summary(outcomes, plan.copies, plan.copied, root), "changes": told, "report": str(closing.report)}
         keep_artifact(result, root)
