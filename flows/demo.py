@@ -22,7 +22,7 @@ BEST_METHODS = {"magnetometer": "ellipsoid_robust", "accelerometer": "ellipsoid_
 QUESTIONS = (
     "SELECT vehicle_id, sensor, axis, value_at_25degc, sd FROM latest_calibration WHERE parameter = 'scale'",
     "SELECT log_uri, quantity, method, reference, tic, rms, rms_unit FROM worst_tic LIMIT 10",
-    "SELECT vehicle_id, lag_s, lag_sd_s, skew_ppm FROM sync",
+    "SELECT vehicle_id, lag_mid_s, lag_sd_s, skew_ppm FROM sync",
 )
 
 
