@@ -116,12 +116,21 @@ class LogsMap:
 
 
 @dataclass(frozen=True)
+class Alerts:
+    """Days after which a sensor's latest calibration has expired, and a vehicle without a usable flight is idle."""
+
+    expires_days: float = 90.0
+    idle_days: float = 30.0
+
+
+@dataclass(frozen=True)
 class Configuration:
     """The loaded file. `vehicle` answers for any id; one that is not configured gets the defaults."""
 
     path: Path | None
     vehicles: dict[str, Vehicle]
     logs: tuple[LogsMap, ...]
+    alerts: Alerts
     _defaults: Vehicle
 
     def vehicle(self, vehicle_id: str) -> Vehicle:
@@ -158,13 +167,20 @@ def parse(document: str, path: Path | None) -> Configuration:
         content = tomllib.loads(document)
     except tomllib.TOMLDecodeError as error:
         raise ConfigurationError("config_syntax", f"{root}: is not TOML: {error}.") from error
-    check.table(content, root, ("defaults", "vehicles", "archive"))
+    check.table(content, root, ("defaults", "vehicles", "archive", "alerts"))
     defaults = _raw(content.get("defaults", {}), root / "defaults")
     vehicles = {}
     for vehicle_id, raw in check.table(content.get("vehicles", {}), root / "vehicles").items():
         place = root / "vehicles" / vehicle_id
         vehicles[vehicle_id] = _vehicle(vehicle_id, _merged(defaults, _raw(raw, place)))
-    return Configuration(path, vehicles, _logs(content.get("archive", {}), root / "archive"), _vehicle("", defaults))
+    logs = _logs(content.get("archive", {}), root / "archive")
+    alerts = _alerts(content.get("alerts", {}), root / "alerts")
+    return Configuration(path, vehicles, logs, alerts, _vehicle("", defaults))
+
+
+def _alerts(value: Any, place: Place) -> Alerts:
+    raw = check.table(value, place, ("expires_days", "idle_days"))
+    return Alerts(**{key: check.positive(days, place / key) for key, days in raw.items()})
 
 
 # --- one function a key: raw TOML value -> checked value

@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from fieldcal.change_points import scatter_variance, strongest_step, temperature_slope
 from fieldcal.fleet import LEAST_FREEDOM, moderated_variance
@@ -41,9 +41,10 @@ FALSE_ALARMS = 0.01
 FALSE_OUTLIERS = 0.05
 """The same for outliers among siblings, which claim less: nothing has changed."""
 MOST_STEPS = 3
-NO_TREND_SIGMAS = 2.0
-"""A step's size is taken without a slope in time when that slope is not beyond this: the two tell the same story twice,
-and a slope that is not there would double the size's sd."""
+STEPS_THAT_DRIFT = 0.05
+"""Share of stepping units that are taken to drift as well, before their record is looked at. A slope in time and a step
+tell much the same story: a slope that is not there would double the sd of the step's size, one that is there and left
+out would shift it."""
 LEAST_LEFT = 0.05
 """Share of a flight's variance that is left to it, at least, however much it draws the line to itself."""
 
@@ -54,6 +55,7 @@ class Trends:
 
     `n_flights`, `n_sessions`: that count; `value`, `sd`: at 25 °C as of the last flight that counts; `best_degc`:
     temperature at which the value is independent of the slope, so that var(T) = var(best) + slope_sd² (T − best)²;
+    `best_day`: the same of the slope in time, at 25 °C;
     `session_sd`, `flight_sd`: scatter between sessions and, beyond their claims, of flights within them; `last_z`: the
     last flight's distance from the line drawn without it, in sd; `change_day`, `change_size`: first flight after the
     latest step, and the step; `drift_p`, `step_p`: chance of such a slope in time, such a step, in a stable unit.
@@ -69,6 +71,7 @@ class Trends:
     slope_per_day: Array
     slope_per_day_sd: Array
     best_degc: Array
+    best_day: Array
     session_sd: Array
     flight_sd: Array
     last_z: Array
@@ -105,21 +108,29 @@ def analyse(h: Histories) -> Trends:
     return _told(h, p, design, fit, steps, step_p)
 
 
+def moving(trends: Trends) -> tuple[np.ndarray, np.ndarray]:
+    """(stepped, drifting), each (g,). Drifting takes more than significance: over its record the parameter has moved by
+    more than one flight scatters."""
+    enough = trends.n_sessions >= ENOUGH_SESSIONS
+    drifting = np.zeros(len(enough), dtype=bool)
+    drifting[enough] = alarms(trends.drift_p[enough])
+    return enough & np.isfinite(trends.change_size), enough & drifting & (trends.moved > 1.0)
+
+
 def statuses(trends: Trends, fleet_p: Array) -> np.ndarray:
     """`insufficient`, `step`, `drifting`, `outlier` or `stable` for each row, the first that applies.
 
-    `fleet_p` (g,): chance of such a distance from the siblings (`fleet.sibling_distance`). Drifting takes more than
-    significance: over its record the parameter has moved by more than one flight scatters.
+    `fleet_p` (g,): chance of such a distance from the siblings (`fleet.sibling_distance`).
     """
     enough = trends.n_sessions >= ENOUGH_SESSIONS
     status = np.full(len(enough), "insufficient", dtype=object)
-    drifting, outlier = np.zeros(len(enough), dtype=bool), np.zeros(len(enough), dtype=bool)
-    drifting[enough] = alarms(trends.drift_p[enough])
+    outlier = np.zeros(len(enough), dtype=bool)
     outlier[enough] = alarms(fleet_p[enough], FALSE_OUTLIERS)
+    stepped, drifting = moving(trends)
     status[enough] = "stable"
     status[enough & outlier] = "outlier"
-    status[enough & drifting & (trends.moved > 1.0)] = "drifting"
-    status[enough & np.isfinite(trends.change_size)] = "step"
+    status[drifting] = "drifting"
+    status[stepped] = "step"
     return status
 
 
@@ -221,13 +232,16 @@ def _told(h: Histories, p: Prepared, design: Array, fit: Regression, steps: np.n
     sd = p.unit * np.sqrt(np.maximum(np.einsum("gp,gp->g", direction, with_all), 0.0))
     with np.errstate(invalid="ignore", divide="ignore"):
         drift_z = fit.coefficients[:, TIME] / np.sqrt(fit.covariance[:, TIME, TIME])
-        to_best = with_all[:, TEMPERATURE] / fit.covariance[:, TEMPERATURE, TEMPERATURE] * p.x_width[:, TEMPERATURE]
+        to_best, earlier = (
+            with_all[:, column] / fit.covariance[:, column, column] * p.x_width[:, column]
+            for column in (TEMPERATURE, TIME)
+        )
     freedom = np.maximum(fit.freedom, LEAST_FREEDOM)
     drift_p = np.where(timed & (fit.freedom > LEAST_FREEDOM), 2.0 * stats.t.sf(np.abs(drift_z), freedom), np.nan)
     single = np.sqrt(p.mean_variance + fit.session_variance + fit.flight_variance)
     time, g = p.keep * design[:, TIME], len(p.unit)
     span = largest(h.row, time, g) + largest(h.row, -time, g)
-    change_day, size, size_sd = _latest_step(h, p, design, drift_z, steps)
+    change_day, size, size_sd = _latest_step(h, p, design, steps)
 
     def only(mask: np.ndarray, x: Array) -> Array:
         return np.where(mask, x, np.nan)
@@ -248,6 +262,7 @@ def _told(h: Histories, p: Prepared, design: Array, fit: Regression, steps: np.n
         slope_per_day=per_day,
         slope_per_day_sd=per_day_sd,
         best_degc=np.where(warm, REFERENCE_DEGC - to_best, p.x_centre[:, TEMPERATURE]),
+        best_day=only(there & fit.active[:, TIME], h.time_day[np.maximum(last, 0)] - earlier),
         session_sd=only(several, p.unit * np.sqrt(fit.session_variance)),
         flight_sd=only(several, p.unit * np.sqrt(fit.flight_variance)),
         last_z=only(p.enough & p.timed, _last_distance(p, design, fit)),
@@ -273,25 +288,38 @@ def _last_distance(p: Prepared, design: Array, fit: Regression) -> Array:
     return np.asarray(error / np.sqrt(spread))
 
 
-def _latest_step(
-    h: Histories, p: Prepared, design: Array, drift_z: Array, steps: np.ndarray
-) -> tuple[Array, Array, Array]:
-    """(time of the first flight, size, sd) of the latest step of each row; NaN without one."""
+def _latest_step(h: Histories, p: Prepared, design: Array, steps: np.ndarray) -> tuple[Array, Array, Array]:
+    """(time of the first flight, size, sd) of the latest step of each row; NaN without one.
+
+    The size is the mean of two models', with a slope in time and without, by their posterior probability: BIC's
+    approximation to the odds of the slope, times the prior ones (`STEPS_THAT_DRIFT`). Its variance holds the models'
+    disagreement. Hoeting et al. (1999), Statistical Science 14, 382–417.
+    """
     grouping, g = p.grouping, len(p.unit)
     latest, found = steps.argmax(axis=1), steps.max(axis=1) >= 0
     day, size, size_sd = np.full(g, np.nan), np.full(g, np.nan), np.full(g, np.nan)
     if not found.any():
         return day, size, size_sd
-    without = design.copy()
-    without[(found & ~(np.abs(drift_z) > NO_TREND_SIGMAS))[grouping.row], TIME] = 0.0
     members = np.flatnonzero(found[grouping.row])
     rows, row = np.unique(grouping.row[members], return_inverse=True)
     sessions, session = np.unique(grouping.session[members], return_inverse=True)
     part = Grouping(row, session, np.searchsorted(rows, grouping.row_of_session[sessions]), len(rows))
-    fit = fit_random_effects(part, without[members], p.y[members], p.variance[members], p.keep[members])
+    data = p.y[members], p.variance[members], p.keep[members]
+    sloped = fit_random_effects(part, design[members], *data)
+    plain = fit_random_effects(part, np.where(np.arange(design.shape[1]) == TIME, 0.0, design[members]), *data)
     own, column = np.arange(len(rows)), TIME + 1 + latest[rows]
-    size[rows] = p.unit[rows] * fit.coefficients[own, column]
-    size_sd[rows] = p.unit[rows] * np.sqrt(fit.covariance[own, column, column])
+    t2 = sloped.coefficients[:, TIME] ** 2 / np.maximum(sloped.covariance[:, TIME, TIME], 1e-300)
+    n, freedom = p.n_sessions[rows], np.maximum(sloped.freedom, 1.0)
+    log_odds = 0.5 * (n * np.log1p(t2 / freedom) - np.log(n)) + special.logit(STEPS_THAT_DRIFT)
+    drifts = np.where(sloped.active[:, TIME], special.expit(log_odds), 0.0)
+    with_slope, without = sloped.coefficients[own, column], plain.coefficients[own, column]
+    mean = drifts * with_slope + (1.0 - drifts) * without
+    variance = (
+        drifts * sloped.covariance[own, column, column]
+        + (1.0 - drifts) * plain.covariance[own, column, column]
+        + drifts * (1.0 - drifts) * (with_slope - without) ** 2
+    )
+    size[rows], size_sd[rows] = p.unit[rows] * mean, p.unit[rows] * np.sqrt(variance)
     first = np.full(len(grouping.row_of_session), len(h.row))
     index = np.flatnonzero(p.keep)
     np.minimum.at(first, grouping.session[index], index)

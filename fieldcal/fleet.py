@@ -7,28 +7,67 @@ from scipy import special, stats
 
 from fieldcal.rotation import Array
 
+LEAST_SIBLINGS = 2
+"""Others that a value is measured against, at least."""
 ENOUGH_SIBLINGS = 5
+"""Others that it takes to look for outliers among them, or to let siblings lend their scatter."""
 MOST_OUTLIERS = 0.25
 """Largest share of a group that is looked at as outliers."""
 REFERENCE_LEVEL = 0.05
 """A value that is an outlier at this level does not serve as a sibling to others."""
+LIKE_FREEDOM = 3.0
+"""What the spread of like groups (the other axes) is worth at most, in degrees of freedom: they agree within a factor
+of about 1.6 (one sd; ψ′(d/2) is the variance of log s²)."""
 LEAST_FREEDOM = 0.5
 
 
-def sibling_distance(group: np.ndarray, value: Array, sd: Array) -> tuple[Array, Array]:
+def sibling_distance(
+    group: np.ndarray, value: Array, sd: Array, *, doubtful: np.ndarray | None = None, kind: np.ndarray | None = None
+) -> tuple[Array, Array]:
     """(distance from the siblings in sd, its p-value), each (n,).
 
     The values of a group scatter about a common mean as siblings do, of unknown variance, plus each value's own sd². A
-    value is measured against the others of its group that are no outliers (`outliers`), t = (x − mean)/√(s²(1 + 1/k) +
-    sd²) with k − 1 degrees of freedom. The p-value is that of one comparison: many are made, which is the caller's to
-    count. NaN and p = 1 in groups with fewer than six.
+    value is measured against the k others of its group that are in no doubt, t = (x − mean)/√(s̃²(1 + 1/k) + sd²). In
+    doubt are outliers (`outliers`) and what `doubtful` marks: units that stepped or drift are no longer where their
+    siblings are. s̃² is the others' variance s², of k − 1 degrees of freedom, drawn towards that of the other groups of
+    its kind, which count for `LIKE_FREEDOM` degrees at most: in a fleet of five the spread of one axis is next to
+    unknown. The p-value is that of one comparison: many are made, which is the caller's to count. NaN and p = 1 with
+    fewer than two others.
+
+    Parameters
+    ----------
+    group : (n,) array
+        Equal for siblings.
+    value, sd : (n,) arrays
+        What is compared.
+    doubtful : (n,) bool array, optional
+        Values that do not serve as siblings to others; they are measured themselves.
+    kind : (n,) array, optional
+        Equal for groups of like spread and unit; a group has one kind. Without it every group is its own.
     """
     z, p = np.full(len(value), np.nan), np.ones(len(value))
-    for members in _groups(group):
-        if len(members) > ENOUGH_SIBLINGS:
-            out = outliers(value[members], sd[members], REFERENCE_LEVEL)
-            z[members], freedom = _distances(value[members], sd[members], ~out)
-            p[members] = 2.0 * stats.t.sf(np.abs(z[members]), freedom)
+    inside = np.ones(len(value), dtype=bool) if doubtful is None else ~doubtful
+    for alike in [np.arange(len(value))] if kind is None else _groups(kind):
+        groups = [alike[members] for members in _groups(group[alike])]
+        for members in groups:
+            good = members[inside[members]]
+            if len(good) > ENOUGH_SIBLINGS:
+                inside[good] = ~outliers(value[good], sd[good], REFERENCE_LEVEL)
+        known = [m[inside[m]] for m in groups]
+        freedom = np.array([len(m) - 1.0 for m in known])
+        squares = np.array([float(np.sum((value[m] - value[m].mean()) ** 2)) if len(m) > 1 else 0.0 for m in known])
+        for i, members in enumerate(groups):
+            lent, others = 0.0, 0.0
+            if kind is not None:
+                rest = np.maximum(freedom, 0.0).sum() - max(freedom[i], 0.0)
+                if rest > 0.0:
+                    lent, others = (squares.sum() - squares[i]) / rest, 1.0 / (1.0 / LIKE_FREEDOM + 1.0 / rest)
+            k = len(known[i]) - inside[members].astype(float)
+            judged = k >= LEAST_SIBLINGS
+            if judged.any():
+                t, left = _distances(value[members], sd[members], inside[members], lent, others)
+                z[members] = np.where(judged, t, np.nan)
+                p[members] = np.where(judged, 2.0 * stats.t.sf(np.abs(t), left), 1.0)
     return z, p
 
 
@@ -58,15 +97,20 @@ def outliers(value: Array, sd: Array, level: float) -> np.ndarray:
     return result
 
 
-def _distances(value: Array, sd: Array, inside: np.ndarray) -> tuple[Array, Array]:
-    """t of each value against the others that are inside, and its degrees of freedom."""
+def _distances(
+    value: Array, sd: Array, inside: np.ndarray, lent: float = 0.0, lent_freedom: float = 0.0
+) -> tuple[Array, Array]:
+    """t of each value against the others that are inside, and its degrees of freedom; their variance drawn towards
+    `lent`."""
     x = value - np.median(value[inside])
     own = inside * x
-    k = inside.sum() - inside.astype(float)
+    k = np.maximum(inside.sum() - inside.astype(float), 1.0)
     mean = (own.sum() - own) / k
-    s2 = np.maximum((own @ own - own**2) / k - mean**2, 0.0) * k / (k - 1.0)
+    s2 = np.maximum((own @ own - own**2) / k - mean**2, 0.0) * k / np.maximum(k - 1.0, 1.0)
+    freedom = k - 1.0 + lent_freedom
+    s2 = ((k - 1.0) * s2 + lent_freedom * lent) / np.maximum(freedom, 1.0)
     spread = np.sqrt(s2 * (1.0 + 1.0 / k) + sd**2)
-    return np.asarray((x - mean) / np.maximum(spread, 1e-300)), np.asarray(k - 1.0)
+    return np.asarray((x - mean) / np.maximum(spread, 1e-300)), np.asarray(np.maximum(freedom, LEAST_FREEDOM))
 
 
 def moderated_variance(group: np.ndarray, variance: Array, freedom: Array) -> tuple[Array, Array]:

@@ -28,8 +28,20 @@ class GyroFit:
     iterations: int = 1
 
 
+NOISE_DENSITY_SD = 0.25
+"""The attenuation by noise is corrected to this share of itself: a sensor's noise is not quite white."""
+MOST_ATTENUATION = 0.2
+"""More of a reading's variance than this is not taken for noise: there would hardly be a manoeuvre."""
+
+
 def fit_equation_error(
-    q: ArrayLike, q_dot: ArrayLike, rate_logged: ArrayLike, *, equations: str = "all", weights: ArrayLike | None = None
+    q: ArrayLike,
+    q_dot: ArrayLike,
+    rate_logged: ArrayLike,
+    *,
+    equations: str = "all",
+    weights: ArrayLike | None = None,
+    noise_variance: ArrayLike | None = None,
 ) -> GyroFit:
     """Least squares of the kinematic equations q̇ = ½ Ξ(q)(Λ ω_d + b).
 
@@ -40,6 +52,9 @@ def fit_equation_error(
     rate_logged : (n, 3) array
         Gyroscope as logged, ω_d, body axes, smoothed with the *same* weights as the attitude: noise in this regressor
         pulls the scales towards zero (−3.5 % raw, −0.8 % smoothed at the paper's noise).
+    noise_variance : (3,) array, optional
+        Variance of the noise that is left in `rate_logged`, its unit². It is taken off the regressor's own (errors in
+        variables), which removes that pull; `equations="scalar"`, the paper's, keeps it.
     equations : {"all", "scalar"}
         "scalar" is the paper's δ̇ alone (Eq. 12–15, with the ½ the paper's X lacks). "all" uses the four: ω̂ = 2Ξᵀq̇
         on (ω_d, 1), where the axes decouple.
@@ -53,8 +68,9 @@ def fit_equation_error(
 
     Notes
     -----
-    It takes attitude and regressor as perfect. Covariances are of the equation's residual, corrected for its colour
-    (Eq. 13's σ_ω is that residual's, not the gyroscope's noise).
+    Covariances are of the equation's residual, corrected for its colour (Eq. 13's σ_ω is that residual's, not the
+    gyroscope's noise), and of the attenuation's correction. Attitude is taken as perfect: what uncertain vector triads
+    do to it, `propagation.constants_to_equation` adds.
     """
     q, q_dot, w_d = (np.asarray(v, dtype=float) for v in (q, q_dot, rate_logged))
     n = len(q)
@@ -66,6 +82,8 @@ def fit_equation_error(
     if not (spread > 0).all():
         raise UnusableFlight("gyro_not_excited", "A gyroscope axis reads one constant value: stuck, or never turned.")
     x = (w_d - centre) / spread
+    share = np.zeros(3) if noise_variance is None else np.asarray(noise_variance, dtype=float) / spread**2
+    share = np.minimum(share, MOST_ATTENUATION)
     robust = weights is not None
     theta: Array = np.zeros(6)
     white: Array = np.zeros((6, 6))
@@ -77,8 +95,9 @@ def fit_equation_error(
         for i in range(3):
             own = np.ix_([i, 3 + i], [i, 3 + i])
             sensitivity = np.stack([x[:, i], np.ones(n)], axis=1)
-            pair = _robust_solve(sensitivity, target[:, i], trust, robust=robust)
+            pair = _robust_solve(sensitivity, target[:, i], trust, robust=robust, share=float(share[i]))
             theta[[i, 3 + i]], residual, white[own], coloured[own] = pair
+            coloured[i, i] += (NOISE_DENSITY_SD * share[i] * theta[i]) ** 2
             squares += float(residual @ residual)
     elif equations == "scalar":
         half = -0.5 * q[:, :3]  # the last row of ½Ξ
@@ -100,21 +119,28 @@ def fit_equation_error(
 
 
 def _robust_solve(
-    sensitivity: Array, target: Array, trust: Array, *, robust: bool
+    sensitivity: Array, target: Array, trust: Array, *, robust: bool, share: float = 0.0
 ) -> tuple[Array, Array, Array, Array]:
-    """Weighted least squares (Huber-refined when `robust`): θ (p,), residual (n,), its two covariances (p, p)."""
+    """Weighted least squares (Huber-refined when `robust`): θ (p,), residual (n,), its two covariances (p, p).
+
+    `share` of the mean square of the first regressor, 1, is noise."""
     weight = trust
     inflation = 1.0
     for _ in range(6 if robust else 1):
         weighted = sensitivity * weight[:, None]
-        theta = np.linalg.solve(weighted.T @ sensitivity, weighted.T @ target)
+        normal = weighted.T @ sensitivity
+        normal[0, 0] -= share * weight.sum()
+        theta = np.linalg.solve(normal, weighted.T @ target)
         residual = target - sensitivity @ theta
         if robust:
             huber = huber_weights(residual, robust_sigma(residual))
             weight = trust * huber
             inflation = huber_inflation(huber)
     white, coloured = _covariances(sensitivity, residual, weight)
-    return theta, residual, white, coloured * inflation
+    stretch = np.ones(len(theta))
+    stretch[0] /= 1.0 - share
+    both = np.outer(stretch, stretch)
+    return theta, residual, white * both, coloured * both * inflation
 
 
 def _covariances(sensitivity: Array, residual: Array, weight: Array) -> tuple[Array, Array]:

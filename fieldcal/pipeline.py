@@ -46,6 +46,7 @@ AXES = ("rotation_body_from_sensor", "body")
 SMOOTHING = ("smoothing_cutoff_hz", "smoothing_ends", "smoothing_side_s")
 VECTORS = ("attitude", "field_ned", "gravity_mps2", "gravity_sign", "nominal_scale", "polarity", "units", *AXES)
 GYRO = ("gyro_max_scale_sd", "nominal_scale", "polarity", "units", "reference_reading", *AXES)
+EQUATION = ("equations", "differentiation_window_s", "smoothing_cutoff_hz", "smoothing_side_s")
 VPS = ("world", "vps_max_lag_s", "vps_min_peak", "vps_max_gap_s")
 FAULTS = {"faults": "sanity.faults"}
 SAMPLES = {"samples": "smoothing.samples", "temperature": "ingest.temperature", **FAULTS}
@@ -116,7 +117,7 @@ PIPELINE: tuple[Stage, ...] = (
         {**SAMPLES, "attitude": "attitude.attitude"},
         ("samples", "attitude"),
         ("calibration", "covariance"),
-        (*GYRO, "equations", "differentiation_window_s"),
+        (*GYRO, *EQUATION),
         ("gyroscope",),
     ),
     # Second pass, now with rates: lever arm (Eq. 3) and sample gate.
@@ -170,10 +171,17 @@ PIPELINE: tuple[Stage, ...] = (
     Stage(
         "gyro_equation_pass2",
         gyroscope.calibrate_gyro_equation,
-        {**SAMPLES, "attitude": "attitude_pass2.attitude", "attitude_faults": "vectors.faults"},
+        {
+            **SAMPLES,
+            **MAGNETOMETER,
+            "accelerometer": "accelerometer_pass2.calibration",
+            "accelerometer_covariance": "accelerometer_pass2.covariance",
+            "attitude": "attitude_pass2.attitude",
+            "attitude_faults": "vectors.faults",
+        },
         ("samples", "attitude"),
         ("calibration", "covariance"),
-        (*GYRO, "equations", "differentiation_window_s"),
+        (*GYRO, *VECTORS, *EQUATION),
         ("gyroscope",),
     ),
     Stage(

@@ -2,7 +2,7 @@
 
 The method is serial: an error of the first triads turns the attitudes that the gyroscope is fitted to, and moves
 with the motion, so the gyroscope's residuals cannot show it. Here their covariance is carried through Wahba's
-problem and the output-error normal equations.
+problem and the normal equations of output error and of equation error.
 """
 
 from __future__ import annotations
@@ -80,3 +80,50 @@ def constants_to_gyro(
         total += gain @ covariance @ gain.T
     transform = from_centred(centre, spread)
     return np.asarray(transform @ total @ transform.T)
+
+
+def constants_to_equation(
+    rate_logged: Array,
+    rate: Array,
+    weight: Array,
+    pairs: list[tuple[Array, Array, Array]],
+    q: Array | None = None,
+) -> Array:
+    """Covariance (6, 6) that uncertain vector triads add to equation error's (λ, b).
+
+    An attitude turned by φ, body axes, has the rate ω̂ + φ̇ + ω × φ: what the regression then takes for a rate.
+
+    Parameters
+    ----------
+    rate_logged, rate : (n, 3) arrays
+        The regressor ω_d and the calibrated rate ω, rad/s.
+    weight : (n,) array
+        Weights of the regression.
+    pairs : list
+        For each independent triad: ∂φ/∂(its constants) (n, 3, 6) in the gyroscope's axes, its derivative in time, and
+        the constants' covariance (6, 6).
+    q : (n, 4) array, optional
+        Attitude where only the scalar equation is fitted (Eq. 12–15); without it the axes decouple.
+    """
+    total = np.zeros((6, 6))
+    centre = np.average(rate_logged, axis=0, weights=weight)
+    spread = np.sqrt(np.average((rate_logged - centre) ** 2, axis=0, weights=weight))
+    x = (rate_logged - centre) / spread
+    for jacobian, derivative, covariance in pairs:
+        turned = derivative + skew(rate) @ jacobian
+        if q is None:
+            gain: Array = np.zeros((6, len(covariance)))
+            for i in range(3):
+                regressors = np.stack([x[:, i], np.ones(len(x))], axis=1)
+                gain[[i, 3 + i]] = _solved(regressors, turned[:, i], weight)
+        else:
+            half = -0.5 * q[:, :3]
+            gain = _solved(np.concatenate([half * x, half], axis=1), np.einsum("ni,nip->np", half, turned), weight)
+        total += gain @ covariance @ gain.T
+    transform = from_centred(centre, spread)
+    return np.asarray(transform @ total @ transform.T)
+
+
+def _solved(regressors: Array, target: Array, weight: Array) -> Array:
+    weighted = regressors * weight[:, None]
+    return np.asarray(np.linalg.solve(weighted.T @ regressors, weighted.T @ target))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fieldcal.provenance import source_digest
-from flows import drift, drift_reasons, drift_warm_up
+from fieldcal.configuration import Alerts
 from flows.drift_changes import Change, changes, last_usable
+from flows.steps import code_digest
 from warehouse import Warehouse
 from warehouse.checksums import history_digest
 from warehouse.files import write_bytes
@@ -31,7 +31,7 @@ class Closing:
     report: Path | None = None
 
 
-def close_night(root: Path) -> Closing:
+def close_night(root: Path, alerts: Alerts) -> Closing:
     """Bring trends and reports up to the history; what is to be told tonight that was not told before.
 
     Trends are regressed only where the history, or the code that makes them, is another than last time. Reports: the
@@ -48,11 +48,16 @@ def close_night(root: Path) -> Closing:
         former = Warehouse(root).scan("drift").collect()
         made_from = _made_from(root)
         if before.get("made_from") != made_from or before.get("made") != history_digest(root, ["drift"]):
-            drift.update_drift(root)
+            from flows.drift import update_drift
+
+            update_drift(root)
         table = Warehouse(root).scan("drift").collect()
-        since = datetime.fromisoformat(before["at"]) if "at" in before else None
-        told = changes(former, table, last_usable(root), now=now, since=since)
-        record = {"at": now.isoformat(), "made_from": made_from, "made": history_digest(root, ["drift"])}
+        # With other limits than last time, what they make old is told whenever it passed them.
+        limits = asdict(alerts)
+        since = datetime.fromisoformat(before["at"]) if before.get("alerts") == limits else None
+        told = changes(former, table, last_usable(root), now=now, since=since, alerts=alerts)
+        made = history_digest(root, ["drift"])
+        record = {"at": now.isoformat(), "made_from": made_from, "made": made, "alerts": limits}
         write_bytes(_place(root), seal(record), durable=False)
         return Closing(told, _reports(root, told))
 
@@ -79,10 +84,9 @@ def _reports(root: Path, told: Sequence[Change]) -> Path:
 
 def _made_from(root: Path) -> str:
     """Digest of what trends are made from: the history and the code."""
-    digest = hashlib.sha256(history_digest(root, INPUTS).encode())
-    digest.update(source_digest(drift.update_drift).encode())
-    for module in (drift, drift_reasons, drift_warm_up):
-        digest.update(Path(str(module.__file__)).read_bytes())
+    digest = hashlib.sha256(f"{history_digest(root, INPUTS)}\0{code_digest()}".encode())
+    for path in sorted(Path(__file__).parent.glob("drift*.py")):
+        digest.update(path.read_bytes())
     return digest.hexdigest()
 
 

@@ -12,7 +12,8 @@ import polars as pl
 from fieldcal.simulate import SENSORS, Experiment
 from fieldcal.simulate_logs import write_flights
 from flows.night import run_night
-from flows.present_night import NightProgress, print_night
+from flows.present_night import print_night
+from flows.progress import NightProgress
 from flows.show import console, number, say, table, with_sd
 from warehouse import Warehouse
 

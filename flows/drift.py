@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from fieldcal import drift, fleet
+from fieldcal import drift, few_sessions, fleet
 from fieldcal.histories import ENOUGH_SESSIONS, Histories
 from flows.ask import existing
-from flows.drift_reasons import reason
+from flows.drift_reasons import AGREEMENT, VPS, reason
 from flows.drift_warm_up import known_slopes
 from schemas import TABLES
 from warehouse import Warehouse
@@ -20,10 +20,9 @@ from warehouse.publish import publish
 from warehouse.store import empty_frame, read_table
 
 KEY = ["imu_id", "sensor", "method", "parameter", "axis"]
+SIBLINGS = ("sensor", "method", "parameter", "axis", "unit")
 SIGNED = ("scale", "bias", "zero_bias")
 """Parameters whose sign follows the polarity of the axis: siblings may be mounted the other way round."""
-VPS, AGREEMENT = "vps", "fit"
-"""What stands as `sensor` of rows about the VPS clock and about agreement (Theil's coefficients)."""
 DAY_US = 86_400_000_000
 ATTEMPTS = 10
 
@@ -60,9 +59,10 @@ def table_of(flights: pl.DataFrame) -> pl.DataFrame:
     """The table `drift` of `history_of_everything`'s rows."""
     if flights.is_empty():
         return empty_frame("drift")
-    rows, trends = trends_of(flights)
-    group, value, sd = _siblings(rows, trends)
-    fleet_z, fleet_p = fleet.sibling_distance(group, value, sd)
+    rows, trends, borrowed = trends_of(flights)
+    group, kind, value, sd = _siblings(rows, trends)
+    stepped, drifting = drift.moving(trends)
+    fleet_z, fleet_p = fleet.sibling_distance(group, value, sd, doubtful=stepped | drifting, kind=kind)
     result = rows.with_columns(
         **{
             name: pl.Series(np.asarray(column, dtype=float), nan_to_null=True)
@@ -81,9 +81,11 @@ def table_of(flights: pl.DataFrame) -> pl.DataFrame:
                 "fleet_z": fleet_z,
             }.items()
         },
+        borrowed_from=pl.Series(borrowed, nan_to_null=True).cast(pl.Int64),
         n_flights=pl.Series(trends.n_flights).cast(pl.Int64),
         n_sessions=pl.Series(trends.n_sessions).cast(pl.Int64),
         change_at=_moments(trends.change_day),
+        best_known_at=_moments(trends.best_day),
         status=pl.Series(drift.statuses(trends, fleet_p).tolist(), dtype=pl.String),
     )
     told = result.with_columns(reason=pl.Series([reason(row) for row in result.iter_rows(named=True)], dtype=pl.String))
@@ -135,8 +137,9 @@ def history_of_everything(root: Path) -> pl.DataFrame:
     )
 
 
-def trends_of(flights: pl.DataFrame) -> tuple[pl.DataFrame, drift.Trends]:
-    """(one row a series with what is the same throughout it, its trends) of `history_of_everything`'s rows."""
+def trends_of(flights: pl.DataFrame) -> tuple[pl.DataFrame, drift.Trends, np.ndarray]:
+    """(one row a series with what is the same throughout it, its trends, how many siblings lent to it) of
+    `history_of_everything`'s rows."""
     numbered = flights.with_columns(row=pl.struct(KEY).rle_id())
     kept = Histories(
         row=numbered["row"].to_numpy().astype(np.int64),
@@ -161,30 +164,40 @@ def trends_of(flights: pl.DataFrame) -> tuple[pl.DataFrame, drift.Trends]:
         trends = drift.analyse(replace(kept, slope_per_degc=known[0], slope_per_degc_sd=known[1]))
     # A flight set aside is not what the line is as of.
     last = numbered.filter(pl.Series(trends.kept)).group_by("row").agg(as_of=pl.col("started_at").last())
-    return rows.join(last, on="row", how="left", maintain_order="left"), trends
+    rows = rows.join(last, on="row", how="left", maintain_order="left")
+    group = rows.select(pl.struct(*SIBLINGS).rank("dense")).to_series().to_numpy()
+    stepped, drifting = drift.moving(trends)
+    steady = (trends.n_sessions >= ENOUGH_SESSIONS) & ~stepped & ~drifting
+    return rows, *few_sessions.borrow(kept, trends, group, _sign(rows, trends), steady)
 
 
-def _siblings(rows: pl.DataFrame, trends: drift.Trends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(group (g,), value, sd) that siblings are compared by. Too short histories are groups of their own.
-
-    A VPS clock's lag is arbitrary, its scatter from session to session is not: there the logarithm of the scatter."""
-    value, sd = trends.value.copy(), trends.sd.copy()
+def _sign(rows: pl.DataFrame, trends: drift.Trends) -> np.ndarray:
+    """−1 (g,) where a row's sign follows its scale's and that is negative, else 1."""
     axis = ["imu_id", "sensor", "method", "axis"]
-    table = rows.with_columns(value=pl.Series(value))
+    table = rows.select(*axis, "parameter", value=pl.Series(trends.value))
     scale = table.filter(pl.col("parameter") == "scale").select(*axis, sign=pl.col("value").sign())
     sign = table.join(scale, on=axis, how="left", maintain_order="left")["sign"].fill_null(1.0).to_numpy()
-    signed = rows["parameter"].is_in(SIGNED).to_numpy()
-    value = np.where(signed, sign * value, value)
+    return np.where(rows["parameter"].is_in(SIGNED).to_numpy(), sign, 1.0)
+
+
+def _siblings(rows: pl.DataFrame, trends: drift.Trends) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(group (g,), kind, value, sd) that siblings are compared by. Too short histories are groups of their own; groups
+    that differ in the axis alone are of a kind.
+
+    A VPS clock's lag is arbitrary, its scatter from session to session is not: there the logarithm of the scatter."""
+    value, sd = _sign(rows, trends) * trends.value, trends.sd
     clock = (rows["sensor"] == VPS).to_numpy()
     with np.errstate(divide="ignore", invalid="ignore"):
         scatter = np.log(trends.session_sd + trends.flight_sd + trends.sd)
         scatter_sd = 1.0 / np.sqrt(2.0 * np.maximum(trends.n_sessions - 1, 1))
     value, sd = np.where(clock, scatter, value), np.where(clock, scatter_sd, sd)
-    group = rows.select(pl.struct("sensor", "method", "parameter", "axis", "unit").rank("dense")).to_series().to_numpy()
-    group = group.astype(np.int64)
+    group = rows.select(pl.struct(*SIBLINGS).rank("dense")).to_series().to_numpy().astype(np.int64)
     alone = (trends.n_sessions < ENOUGH_SESSIONS) | ~np.isfinite(value) | ~np.isfinite(sd)
-    group[alone] = group.max() + 1 + np.arange(alone.sum())
-    return group, np.where(alone, 0.0, value), np.where(alone, 1.0, sd)
+    kind = rows.select(pl.struct("sensor", "method", "parameter", "unit").rank("dense")).to_series().to_numpy()
+    kind = kind.astype(np.int64)
+    for label in (group, kind):
+        label[alone] = label.max() + 1 + np.arange(alone.sum())
+    return group, kind, np.where(alone, 0.0, value), np.where(alone, 1.0, sd)
 
 
 def _moments(day: np.ndarray) -> pl.Series:

@@ -10,13 +10,11 @@ from typing import Any
 
 import polars as pl
 
-from fieldcal.errors import FieldcalError
-from flows.drift import AGREEMENT
-from flows.drift_reasons import UNCONFIRMED_SIGMAS
+from fieldcal.configuration import Alerts
+from flows.drift_reasons import AGREEMENT, UNCONFIRMED_SIGMAS
 from warehouse import Warehouse
 
-EXPIRES_DAYS = 90.0
-IDLE_DAYS = 30.0
+NORMAL = Alerts()
 STATUSES = ("step", "drifting", "outlier")
 KINDS = (*STATUSES, "last_flight", "recovered", "expired", "idle")
 TELLING = ("zero_bias", "zero", "scale", "bias")
@@ -49,8 +47,7 @@ def changes(
     *,
     now: datetime,
     since: datetime | None = None,
-    expires_days: float = EXPIRES_DAYS,
-    idle_days: float = IDLE_DAYS,
+    alerts: Alerts = NORMAL,
 ) -> list[Change]:
     """What is to be told tonight and was not told by the night before, the gravest first.
 
@@ -62,13 +59,11 @@ def changes(
         `last_usable` of the warehouse.
     now, since : datetime
         Time of this night and of the one before. Without `since` every expired calibration and idle vehicle is told.
-    expires_days, idle_days : float
+    alerts : Alerts
         Age at which a sensor's latest calibration, a vehicle's latest usable flight, is to be told.
     """
-    if expires_days <= 0 or idle_days <= 0:
-        raise FieldcalError("wrong_option", "Calibrations expire and vehicles idle after a positive number of days.")
     both = table.join(former.select(*SERIES, "status", "last_z", "change_at"), on=SERIES, how="left", suffix="_before")
-    told = [*_news(both), *_ages(latest, now, since, expires_days, idle_days)]
+    told = [*_news(both), *_ages(latest, now, since, alerts)]
     return sorted(told, key=lambda c: (KINDS.index(c.kind), c.vehicle_id, c.sensor or "", c.axis or ""))
 
 
@@ -122,12 +117,12 @@ def _news(both: pl.DataFrame) -> Iterable[Change]:
 
 
 def _ages(
-    latest: pl.DataFrame, now: datetime, since: datetime | None, expires_days: float, idle_days: float
+    latest: pl.DataFrame, now: datetime, since: datetime | None, alerts: Alerts
 ) -> Iterable[Change]:
     """Sensors and vehicles that passed the limit since the night before. An IMU counts where it flew last."""
     current = latest.sort("last_at").unique(["imu_id", "sensor"], keep="last").sort("vehicle_id", "imu_id", "sensor")
     for row in current.iter_rows(named=True):
-        if _passed(row["last_at"], now, since, expires_days):
+        if _passed(row["last_at"], now, since, alerts.expires_days):
             days = (now - row["last_at"]).days
             yield Change(
                 kind="expired",
@@ -137,11 +132,11 @@ def _ages(
                 axis=None,
                 parameters=(),
                 sentence=f"{row['vehicle_id']}, {row['imu_id']}, {row['sensor']}: last calibrated {days} days ago,"
-                f" on {row['last_at']:%Y-%m-%d}; it counts for {expires_days:g} days.",
+                f" on {row['last_at']:%Y-%m-%d}; it counts for {alerts.expires_days:g} days.",
             )
     flown = latest.group_by("vehicle_id").agg(pl.col("last_at").max()).sort("vehicle_id")
     for vehicle_id, last_at in flown.iter_rows():
-        if _passed(last_at, now, since, idle_days):
+        if _passed(last_at, now, since, alerts.idle_days):
             yield Change(
                 kind="idle",
                 vehicle_id=vehicle_id,

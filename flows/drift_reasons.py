@@ -8,6 +8,8 @@ from typing import Any
 from fieldcal.histories import ENOUGH_SESSIONS
 from flows.show import number, with_sd
 
+VPS, AGREEMENT = "vps", "fit"
+"""What stands as `sensor` of rows about the VPS clock and about agreement (Theil's coefficients)."""
 UNCONFIRMED_SIGMAS = 5.0
 """Distance of the last flight from the line beyond which it may be the first after a step."""
 
@@ -17,7 +19,11 @@ def reason(row: Mapping[str, Any]) -> str | None:
     unit = "" if row["unit"] in (None, "1") else f" {row['unit']}"
     if row["status"] == "insufficient":
         sessions = row["n_sessions"]
-        return f"{sessions} session{'' if sessions == 1 else 's'}: a trend needs {ENOUGH_SESSIONS}."
+        told = f"{sessions} session{'' if sessions == 1 else 's'}: a trend needs {ENOUGH_SESSIONS}."
+        if row["borrowed_from"] is None:
+            return told
+        lent = f"scatter between sessions ({number(row['session_sd'])}{unit}) and slope are those of"
+        return f"{told} The value is the sessions' mean; {lent} {row['borrowed_from']} siblings."
     if row["status"] == "step":
         size = with_sd(row["change_size"], row["change_size_sd"])
         return f"Stepped by {size}{unit} before the flight of {row['change_at']:%Y-%m-%d %H:%M} UTC."

@@ -90,9 +90,15 @@ def print_refusals(console: Console, runs: Rows) -> None:
 
 
 def is_consequence(run: Mapping[str, Any]) -> bool:
-    """Whether a stage stopped only because another gave it nothing."""
-    code = str(run["reason_code"])
-    return run["status"] == "refused" and (code.startswith(("no_samples", "no_attitude", "no_manoeuvre")))
+    """Whether a stage stopped only because another stage gave it nothing: `no_` and one of the tables that it needs.
+
+    The same code is a cause where a stage finds it in the log itself: equation error's `no_gyroscope`."""
+    from fieldcal.pipeline import PIPELINE
+
+    code, stage = str(run["reason_code"]), next((s for s in PIPELINE if s.name == run["stage"]), None)
+    needs = () if stage is None else (need for need in stage.needs if not stage.reads[need].startswith("ingest."))
+    wanting = code in ("no_samples", "no_manoeuvre") or code in [f"no_{need}" for need in needs]
+    return bool(run["status"] == "refused" and wanting)
 
 
 def fit_table(rows: Rows) -> Any:

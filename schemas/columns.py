@@ -288,6 +288,19 @@ BEST_KNOWN_DEGC = Column(
     "degC",
     "temperature at which value and slope_per_degc are independent: var(T) = var there + slope sd^2 (T - it)^2",
 )
+BEST_KNOWN_AT = Column(
+    "best_known_at",
+    pa.timestamp("us", tz="UTC"),
+    "",
+    "moment, UTC, at which value_at_25degc brought there and slope_per_day are independent: var(t) = var there + slope"
+    " sd^2 (t - it)^2",
+)
+BORROWED_FROM = Column(
+    "borrowed_from",
+    _I64,
+    "1",
+    "siblings whose scatter between sessions and slope the value uses below five sessions; null: not needed, too few",
+)
 SESSION_SD = Column(
     "session_sd", _F64, "named by column unit", "scatter of the parameter between sessions beyond the flights' own sd"
 )

@@ -204,7 +204,7 @@ _HISTORY = (
     Table(
         "drift",
         "history",
-        2,
+        3,
         "one row an IMU, sensor, method, parameter and axis: trend over temperature and time",
         (
             c.VEHICLE_ID,
@@ -234,6 +234,8 @@ _HISTORY = (
             c.CHANGE_SIZE_SD,
             c.FLEET_Z,
             c.REASON,
+            c.BEST_KNOWN_AT,
+            c.BORROWED_FROM,
         ),
         ("imu_id", "sensor", "method", "parameter", "axis"),
     ),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldcal.configuration import Field, load, parse
+from fieldcal.configuration import Alerts, Field, load, parse
 from fieldcal.errors import ConfigurationError
 from fieldcal.parameters import PARAMETERS
 
@@ -58,6 +58,8 @@ time = "log"
 imu_fields = { gyroscope = "gyro", accelerometer = ["a.x", "a.y", "a.z"], magnetometer = "mag", temperature = "t" }
 [archive]
 logs = [{ glob = "2026/*/flight_*.csv", vehicle = "morpheus-1", session = "spring" }]
+[alerts]
+expires_days = 45
 """
 
 FLEET = """
@@ -115,6 +117,7 @@ def test_every_key_of_the_contract_is_understood() -> None:
     assert vehicle.mcap.imu_fields is not None
     assert vehicle.mcap.imu_fields["accelerometer"] == ("a.x", "a.y", "a.z")
     assert configuration.logs[0].vehicle == "morpheus-1"
+    assert configuration.alerts == Alerts(expires_days=45.0, idle_days=30.0)
 
 
 def test_a_fleet_of_different_vehicles_loads(tmp_path: Path) -> None:
@@ -229,6 +232,9 @@ def test_settings_are_plain_json_and_leave_names_out() -> None:
         ("[archive]\nlogs = [{ glob = '../x/*.csv' }]", "wrong_value", "leaves the archive"),
         ("[archive]\nlogs = [{ vehicle = 'a' }]", "wrong_value", "glob is missing"),
         ("[archive]\nlogs = 3", "wrong_type", "a list of tables"),
+        ("[alerts]\nidle_days = 0", "wrong_value", "above zero"),
+        ("[alerts]\nexpires_days = '90'", "wrong_type", "a number is needed here"),
+        ("[alerts]\nexpire_days = 90", "unknown_key", "expires_days"),
         ("[vehicles.a\n", "config_syntax", "is not TOML"),
     ],
 )

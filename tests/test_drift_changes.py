@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import polars as pl
-import pytest
 from drift_history import publish_fleet
 from history_rows import START, rows
 
-from fieldcal.errors import FieldcalError
+from fieldcal.configuration import Alerts
+from flows.closing import close_night
 from flows.drift_changes import changes, last_usable
 
 NOW = START + dt.timedelta(days=100)
@@ -72,5 +72,18 @@ def test_age_is_told_when_it_passes_the_limit(tmp_path: Path) -> None:
     told = changes(none, none, latest, now=START + dt.timedelta(days=104.5))
     assert told[0].sentence.startswith("v00, imu-00, accelerometer: last calibrated 90 days ago")
     assert told[-1].sentence.startswith("v00: no usable flight for 90 days")
-    with pytest.raises(FieldcalError):
-        changes(none, none, latest, now=NOW, idle_days=0.0)
+    sooner = changes(
+        none, none, latest, now=START + dt.timedelta(days=20), alerts=Alerts(expires_days=5.0, idle_days=60.0)
+    )
+    assert [c.kind for c in sooner] == ["expired", "expired"]
+    assert "it counts for 5 days" in sooner[0].sentence
+
+
+def test_limits_of_the_configuration_reach_the_night(tmp_path: Path) -> None:
+    """Whoever shortens a limit is told at once of what that makes old, and once only."""
+    publish_fleet(tmp_path, units=1, sessions=3)
+    far = Alerts(expires_days=1e5, idle_days=1e5)
+    assert close_night(tmp_path, far).changes == []
+    near = Alerts(expires_days=1e5, idle_days=1e-3)
+    assert [c.kind for c in close_night(tmp_path, near).changes] == ["idle"]
+    assert close_night(tmp_path, near).changes == []

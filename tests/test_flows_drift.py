@@ -256,3 +256,28 @@ def test_flights_published_meanwhile_are_in_the_trends(tmp_path: Path, monkeypat
     update_drift(tmp_path / "root")
     tables = [Warehouse(root).scan("drift").collect() for root in (tmp_path / "root", other)]
     assert tables[0].equals(tables[1])
+
+
+def test_a_new_unit_borrows_from_the_fleet_and_says_so(tmp_path: Path) -> None:
+    """v12 has three sessions, v13 three with a step: the one is averaged, the other flies with its latest flight."""
+    publish_fleet(tmp_path, 12)
+    young = publish_fleet(
+        tmp_path / "young", 14, 3, seed=1, spoil=lambda u, s, a, k, v: v + 20 * TAU * (u == 13 and k == 2)
+    )
+    for vehicle in ("v12", "v13"):
+        rows = young[vehicle]
+        flights = Warehouse(tmp_path / "young").scan("flight", vehicle_id=vehicle).collect()
+        publish(tmp_path, vehicle, {"calibration": rows, "flight": flights}, rows["flight_id"].unique().to_list())
+    update_drift(tmp_path)
+    told = Warehouse(tmp_path).scan("drift").filter(pl.col("n_sessions") == 3).collect()
+    assert (told["status"] == "insufficient").all()
+    found = Warehouse(tmp_path).sql("FROM latest_calibration WHERE vehicle_id IN ('v12', 'v13')")
+    averaged, stepped = (found.filter(vehicle_id=v) for v in ("v12", "v13"))
+    assert averaged.filter(source="drift").height >= 5  # of six axes
+    row = averaged.filter(source="drift").row(0, named=True)
+    assert row["why"].startswith("Mean of 3 sessions, weighted by the scatter of 12 siblings")
+    assert row["sd"] < TAU
+    assert told.filter(imu_id="imu-12")["reason"][0].startswith("3 sessions: a trend needs 5. The value is")
+    assert (stepped["source"] == "flight").all()
+    last = young["v13"].filter(flight_id="v13-002").sort("sensor", "axis")
+    assert stepped.sort("sensor", "axis")["value_at_25degc"].to_list() == last["value"].to_list()

@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from mcap.reader import make_reader
 from mcap_ros2.reader import read_ros2_messages
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from fieldcal import ingest
 from fieldcal.configuration import load
 from fieldcal.frames import matrix, triad
 from fieldcal.logs import log_sha256
+from fieldcal.logs.write_mcap import imu_channel, write_mcap
 from fieldcal.rotation import FRD_FROM_FLU
 from fieldcal.simulate import Experiment
 from fieldcal.simulate_logs import write_flights
@@ -94,6 +97,52 @@ def test_mcap_is_rep_103(log: Path, root: Path, wanted: dict[str, np.ndarray], t
     field = [m.ros_msg.magnetic_field for m in read_ros2_messages(str(path), topics=["/imu/mag_norm"])]
     assert same(np.array([[v.x, v.y, v.z] for v in field]), wanted["magnetometer"] @ FRD_FROM_FLU)
     assert not list(tmp_path.glob("*.part"))
+
+
+@pytest.mark.parametrize("release", [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY])
+def test_mcap_holds_the_messages_that_ros_2_defines(log: Path, root: Path, tmp_path: Path, release: Stores) -> None:
+    """Definitions and decoder of `rosbags`, which shares nothing with ours: schemas field by field, payloads byte by
+    byte; names, encodings and times as a ROS 2 recorder leaves them."""
+    path = tmp_path / "out.mcap"
+    assert run(["apply", str(log), "-o", str(path), "--warehouse", str(root)]) == 0
+    store = get_typestore(release)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        assert {c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values()} == {
+            "/imu/data": "sensor_msgs/msg/Imu",
+            "/imu/mag_norm": "sensor_msgs/msg/MagneticField",
+            "/imu/temperature": "sensor_msgs/msg/Temperature",
+        }
+        for schema in summary.schemas.values():
+            assert schema.encoding == "ros2msg"
+            for name, definition in get_types_from_msg(schema.data.decode(), schema.name).items():
+                assert definition == store.fielddefs[name], name
+        count = 0
+        for schema, channel, message in reader.iter_messages():
+            assert channel.message_encoding == "cdr"
+            decoded: Any = store.deserialize_cdr(message.data, schema.name)
+            assert bytes(store.serialize_cdr(decoded, schema.name)) == message.data
+            stamp = decoded.header.stamp
+            assert stamp.sec * 10**9 + stamp.nanosec == message.publish_time == message.log_time
+            assert decoded.header.frame_id == "base_link"
+            if schema.name == "sensor_msgs/msg/Imu":
+                # −1: no orientation; 0: a covariance that is not known
+                assert decoded.orientation_covariance.tolist() == [-1.0] + [0.0] * 8
+                assert not decoded.angular_velocity_covariance.any()
+                assert not decoded.linear_acceleration_covariance.any()
+            count += 1
+    assert count == sum(summary.statistics.channel_message_counts.values()) > 5000
+
+
+def test_a_sensor_that_the_log_lacks_is_marked_in_its_message(tmp_path: Path) -> None:
+    t, rate = np.arange(3), np.ones((3, 3))
+    write_mcap(tmp_path / "x.mcap", [imu_channel(t, None, rate, np.full((3, 3), np.nan))])
+    (first, *_) = [m.ros_msg for m in read_ros2_messages(str(tmp_path / "x.mcap"))]
+    assert first.linear_acceleration_covariance[0] == -1.0
+    assert first.angular_velocity_covariance[0] == 0.0
 
 
 @pytest.mark.parametrize("form", ["px4", "ardupilot", "ros", "kalibr", "json", "c"])

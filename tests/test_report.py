@@ -128,7 +128,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for key in (work.records[stage]["run_key"],)
             if name in work.records[stage]["outputs"]
         }
-        history = published_tables(leading, tables)
+        history = published_tables([(leading, tables)])
         history["flight"] = rows_frame("flight", [flight_row(job, leading, facts)])
         history["run"] = rows_frame("run", run_rows(leading, work.records))
         publish(root, job.vehicle_id, history, [job.flight_id])
@@ -348,9 +348,12 @@ def test_a_wrapped_angle_is_broken_not_drawn_across() -> None:
     assert np.isnan(without_wraps(angle)).tolist() == [False, False, True, False]
 
 
+NOON = dt.datetime(2026, 5, 11, 12, tzinfo=dt.UTC)
+
+
 def test_band_is_the_regressions_own_standard_deviation() -> None:
     row = {"value_at_25degc": 2.0, "sd": 0.3, "slope_per_degc": 0.1, "slope_per_degc_sd": 0.02, "best_known_degc": None}
-    row |= {"slope_per_day": -0.5, "slope_per_day_sd": 0.4}
+    row |= {"slope_per_day": -0.5, "slope_per_day_sd": 0.4, "best_known_at": None, "as_of": NOON}
     value, sd = predicted(row, 35.0, -1.0)
     assert value == pytest.approx(2.0 + 1.0 + 0.5)
     assert sd == pytest.approx(np.sqrt(0.3**2 + 0.2**2 + 0.4**2))
@@ -358,5 +361,9 @@ def test_band_is_the_regressions_own_standard_deviation() -> None:
     apart = {**row, "slope_per_degc_sd": 0.01, "best_known_degc": 5.0}
     for degc, variance in ((25.0, 0.3**2), (5.0, 0.3**2 - 0.2**2), (-15.0, 0.3**2)):
         assert predicted(apart, degc, 0.0)[1] == pytest.approx(np.sqrt(variance))
+    # … and independent of the slope in time ten days before the last flight, where the sd is least
+    timely = {**row, "slope_per_day_sd": 0.02, "best_known_at": NOON - dt.timedelta(days=10)}
+    for days, variance in ((0.0, 0.3**2), (-10.0, 0.3**2 - 0.2**2), (-20.0, 0.3**2)):
+        assert predicted(timely, 25.0, days)[1] == pytest.approx(np.sqrt(variance))
     value, sd = predicted({**row, "slope_per_day": None, "slope_per_day_sd": None}, 25.0, 9.0)
     assert (float(value), float(sd)) == (2.0, 0.3)

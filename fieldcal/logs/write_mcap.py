@@ -68,15 +68,19 @@ def imu_channel(
     topic: str = "/imu/data_raw",
     frame_id: str = "imu",
 ) -> MessageChannel:
-    """`sensor_msgs/Imu` without orientation: rates in rad/s, specific force in m/s^2, both (n, 3)."""
-    gyroscope = _vectors(gyroscope_radps, 3)
-    no_orientation = np.zeros((len(gyroscope), 9))
-    no_orientation[:, 0] = -1.0
-    values = {
-        "orientation_covariance": no_orientation,
-        "angular_velocity": gyroscope,
+    """`sensor_msgs/Imu` without orientation: rates in rad/s, specific force in m/s^2, both (n, 3).
+
+    A vector that is NaN in all messages is one that the log does not have: like the orientation it is marked by −1 in
+    its covariance, which otherwise is 0, "unknown", as the message's definition has it.
+    """
+    vectors = {
+        "angular_velocity": _vectors(gyroscope_radps, 3),
         "linear_acceleration": _vectors(accelerometer_mps2, 3),
     }
+    absent = np.zeros((len(vectors["angular_velocity"]), 9))
+    absent[:, 0] = -1.0
+    values = {"orientation_covariance": absent, **vectors}
+    values |= {f"{name}_covariance": absent for name, v in vectors.items() if len(v) and np.isnan(v).all()}
     return _stamped(topic, "sensor_msgs/Imu", t_ns, log_time_ns, values, frame_id)
 
 

@@ -22,7 +22,8 @@ from fieldcal.frames import (
     triad,
 )
 from fieldcal.gyro_equation import GyroFit
-from fieldcal.propagation import attitude_jacobian, constants_to_gyro
+from fieldcal.propagation import attitude_jacobian, constants_to_equation, constants_to_gyro
+from fieldcal.regressor_noise import smoothed_noise_variance
 from fieldcal.results import StageResult, triad_rows
 from fieldcal.rotation import Array
 from fieldcal.stages.attitude import VECTOR_SENSORS, body_vectors, known_vectors, logged_constants, sensor_attitude
@@ -47,23 +48,47 @@ GYRO_REASONS = "Gyroscope axes refused ({axes}): too little rotation about them,
 
 
 def calibrate_gyro_equation(tables: Tables, s: Settings) -> StageResult:
-    """samples, attitude → calibration of the gyroscope by equation error (Eq. 10–15)."""
+    """samples, attitude → calibration of the gyroscope by equation error (Eq. 10–15).
+
+    Noise that smoothing leaves in the readings is taken off the regressor; where the vector triads' covariances are
+    given, what they do to the result is in its sd."""
     samples, attitude = tables["samples"], tables["attitude"]
     logged = matrix(samples, triad("gyroscope", "smoothed_"))
     if np.isnan(logged).any():
         return StageResult(status="refused", reason_code="no_gyroscope", reason="The log has no gyroscope readings.")
     q = sensor_attitude(matrix(attitude, QUATERNION), s)
+    weight = attitude["weight"].to_numpy()
+    noise_variance = smoothed_noise_variance(
+        seconds(samples["t_ns"], samples["t_ns"][0]),
+        matrix(samples, triad("gyroscope")),
+        samples["segment"].to_numpy(),
+        s["smoothing_cutoff_hz"],
+        side_s=s["smoothing_side_s"],
+    )
     try:
         fit = gyro_equation.fit_equation_error(
             q,
             differentiate_by_segment(samples, q, s["differentiation_window_s"]),
             logged,
             equations=s["equations"],
-            weights=attitude["weight"].to_numpy(),
+            weights=weight,
+            noise_variance=noise_variance,
         )
     except UnusableFlight as error:
         return refusal(error, "gyroscope")
-    return _gyro_result("equation_error", fit, fit.covariance, tables, s, {"residual_rms": fit.residual_rms})
+    pairs = []
+    for jacobian, covariance in _triad_uncertainty(tables, s):
+        flat = jacobian.reshape(len(q), -1)
+        derivative = differentiate_by_segment(samples, flat, s["differentiation_window_s"]).reshape(jacobian.shape)
+        pairs.append((jacobian, derivative, covariance))
+    rate = fit.scale * logged + fit.bias
+    only_scalar = q if s["equations"] == "scalar" else None
+    covariance = fit.covariance + constants_to_equation(logged, rate, weight, pairs, only_scalar)
+    measured = {
+        "residual_rms": fit.residual_rms,
+        "noise_share_of_regressor": [float(v) for v in noise_variance / logged.var(axis=0)],
+    }
+    return _gyro_result("equation_error", fit, covariance, tables, s, measured)
 
 
 def _gyro_result(
@@ -229,6 +254,8 @@ def _suitable_stretch(start: GyroFit, t: Array, logged: Array, tables: Tables) -
 def _triad_uncertainty(tables: Tables, s: Settings) -> list[tuple[Array, Array]]:
     """[(directions sensed (n, 3) …)] see `propagation`: one (Jacobian of the attitude, covariance) pair per vector
     triad."""
+    if not any(f"{name}_covariance" in tables for name in VECTOR_SENSORS):
+        return []
     samples, attitude = tables["samples"], tables["attitude"]
     axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
     vectors = body_vectors(samples, known_vectors(tables, s), s, prefix="smoothed_")

@@ -45,16 +45,18 @@ def predicted(row: Mapping[str, Any], degc: Array | float, days: Array | float) 
     """Value and standard deviation of a drift row's regression at a temperature, so many days after its moment.
 
     The value at 25 °C and the slope on temperature are correlated; they are independent at `best_known_degc`, B:
-    var(T) = sd² + s²[(T − B)² − (25 °C − B)²], s the slope's sd. Without B the variances are added, and so is that of
-    the slope in time, whose covariances the table does not keep: the band is then rather too wide.
+    var(T) = sd² + s²[(T − B)² − (25 °C − B)²], s the slope's sd. So are the value and the slope in time at
+    `best_known_at`. Where one is not known the variances are added. Away from 25 °C and from the moment `as_of` at
+    once, the covariance of the two slopes is missing: ask along one of them.
     """
     degc, later = np.asarray(degc, dtype=float), np.asarray(days, dtype=float)
     slope, slope_sd = row["slope_per_degc"] or 0.0, row["slope_per_degc_sd"] or 0.0
     best = REFERENCE_DEGC if row["best_known_degc"] is None else row["best_known_degc"]
     value = row["value_at_25degc"] + slope * (degc - REFERENCE_DEGC) + (row["slope_per_day"] or 0.0) * later
     at_temperature = (row["sd"] or 0.0) ** 2 + slope_sd**2 * ((degc - best) ** 2 - (REFERENCE_DEGC - best) ** 2)
-    variance = np.maximum(at_temperature, 0.0) + ((row["slope_per_day_sd"] or 0.0) * later) ** 2
-    return np.asarray(value), np.sqrt(variance)
+    best_day = 0.0 if row["best_known_at"] is None else days_after([row["best_known_at"]], row["as_of"])[0]
+    in_time = (row["slope_per_day_sd"] or 0.0) ** 2 * ((later - best_day) ** 2 - best_day**2)
+    return np.asarray(value), np.sqrt(np.maximum(at_temperature + in_time, 0.0))
 
 
 def days_after(moments: list[datetime | None], reference: datetime) -> Array:

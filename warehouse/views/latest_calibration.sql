@@ -1,6 +1,6 @@
 -- One row an IMU, sensor, parameter and axis: the value at 25 degC, its sd and its slope, where they come from (source)
 -- and why. source = 'drift': the unit's trend as of its last flight, which draws a noisy single flight towards the history
--- by its sd. source = 'flight': the latest value that was not refused, where there is no trend yet, or where it lies more
+-- by its sd; with two to four sessions the siblings lend the scatter and the slope. source = 'flight': the latest value that was not refused, where there is no trend yet, or where it lies more
 -- than 5 sd off the trend: what may be the first flight after a step is never averaged away. With a slope it is
 -- brought to 25 degC, else taken as it is, whatever its temperature. sd goes with best_known_degc: var(T) = sd^2 +
 -- slope_per_degc_sd^2 ((T - best)^2 - (25 - best)^2). Of several methods in a flight the most exact counts.
@@ -26,7 +26,7 @@ WITH latest AS (
 beside AS (
     SELECT
         k.imu_id, k.sensor, k.parameter, k.axis, l, d,
-        d.value_at_25degc IS NOT NULL AND d.status <> 'insufficient' AS trend,
+        d.value_at_25degc IS NOT NULL AND (d.status <> 'insufficient' OR d.borrowed_from IS NOT NULL) AS trend,
         coalesce(d.slope_per_degc * (l.at_degc - 25), 0) AS warmer,
         coalesce(d.slope_per_degc_sd, 0) AS slope_sd,
         coalesce(d.best_known_degc, 25) AS best
@@ -75,6 +75,10 @@ SELECT
         WHEN beyond THEN printf(
             'The latest flight is %.1f sd off the trend of %d flights: spoiled, or the first after a step. Its own value is given.',
             off, d.n_flights
+        )
+        WHEN by_trend AND d.borrowed_from IS NOT NULL THEN printf(
+            'Mean of %d sessions, weighted by the scatter of %d siblings, whose slope brings them to 25 degC.',
+            d.n_sessions, d.borrowed_from
         )
         WHEN by_trend THEN concat(
             'Trend of ', d.n_flights, ' flights',
