@@ -30,6 +30,8 @@ def print_flight(console: Console, document: Mapping[str, Any]) -> None:
     if document["calibration"]:
         console.print(parameter_table(document["calibration"]))
     print_refusals(console, document["run"])
+    for sentence in advised(document["run"]):
+        console.print(sentence, markup=False)
     if document["fit"]:
         console.print(fit_table(document["fit"]))
     if document["sync"] is not None:
@@ -87,6 +89,11 @@ def print_refusals(console: Console, runs: Rows) -> None:
             console.print("    " + ", ".join(f"{k} = {cell(v)}" for k, v in numbers.items()), markup=False)
     if follow:
         console.print(f"not run for want of their input: {', '.join(follow)}", markup=False)
+
+
+def advised(runs: Rows) -> list[str]:
+    """What would make weak constants better, by the stages that found them (a refused stage says it in its reason)."""
+    return [run["measured"]["advice"] for run in runs if run["status"] == "ok" and run["measured"].get("advice")]
 
 
 def is_consequence(run: Mapping[str, Any]) -> bool:

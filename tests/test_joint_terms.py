@@ -1,4 +1,4 @@
-"""Optional terms of the joint estimate: exact without noise, let in where they are needed, kept out where they are not."""
+"""Optional terms of the joint estimate: exact without noise, let in where needed, kept out where they are not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The VPS inside the joint estimate: what it gains, that it is honest, that bad poses do no harm, nothing without it."""
+"""The VPS inside the joint estimate: what it gains, honest sd, bad poses do no harm, and nothing without it."""
 
 from __future__ import annotations
 

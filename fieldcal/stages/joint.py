@@ -46,7 +46,7 @@ MAX_GYRO_NOISE_SHARE = 0.5
 
 def estimate_jointly(tables: Tables, s: Settings) -> StageResult:
     """samples, serial constants → calibration, attitude, covariance, fit: everything in one likelihood."""
-    if s["method"] != METHOD:
+    if not chosen(s):
         return StageResult(status="absent", reason_code="not_selected", reason='The method is "serial".')
     if "samples" not in tables:
         return StageResult(status="refused", reason_code="no_samples", reason="No segment of the log is usable.")
@@ -74,11 +74,19 @@ def estimate_jointly(tables: Tables, s: Settings) -> StageResult:
     )
 
 
+def chosen(s: Settings) -> tuple[str, ...]:
+    """Sensors whose constants this method is to give: `method` names one for all, or one for each."""
+    method = s["method"]
+    return tuple(name for name in SENSORS if (method if isinstance(method, str) else method[name]) == METHOD)
+
+
 def _held_out(
     fit: JointFit, readings: Readings, tables: Tables, s: Settings, arm: Array | None, poses: Poses | None
 ) -> dict[str, pl.DataFrame]:
     """Gyroscope constants from the first part of the flight alone, with `from_ns`, where the rest begins: `verify`
-    predicts that. None where the part determines nothing."""
+    predicts that. None where the part determines nothing, or another method gives the gyroscope's."""
+    if "gyroscope" not in chosen(s):
+        return {}
     split = int(HELD_IN_SHARE * len(readings.t))
     part = readings.part(slice(0, split))
     known = {name: fit.constants(name)[:2] for name in SENSORS if name in fit.layout}
@@ -166,7 +174,7 @@ def _written(fit: JointFit, tables: Tables, s: Settings, axes: Array) -> StageRe
     """Rows with a status by sensor and axis, the attitude, the covariance, and the numbers that decided."""
     rows: list[dict[str, Any]] = []
     codes: dict[str, list[str | None]] = {}
-    for name in SENSORS:
+    for name in chosen(s):
         if name not in fit.layout:
             continue
         full, bias, covariance, cross_sd = _triad(fit, name)
@@ -185,14 +193,18 @@ def _written(fit: JointFit, tables: Tables, s: Settings, axes: Array) -> StageRe
             reason_code=tuple(codes[name]),  # type: ignore[arg-type]
             cross_sd=cross_sd,
         )
-    rows += _slope_rows(fit, tables, s, codes["gyroscope"])
+    if "gyroscope" in codes:
+        rows += _slope_rows(fit, tables, s, codes["gyroscope"])
     bad = [f"{name} {axis}: {c}" for name, own in codes.items() for axis, c in zip(AXES, own, strict=True) if c]
     every = len(bad) == 3 * len(codes)
     measured = _measured(fit, axes)
     first = next((code for own in codes.values() for code in own if code), None)
     reason = f"Refused by the joint estimate ({', '.join(bad)}). {measured['advice']}".strip() if bad else None
+    if not codes:
+        first, reason = f"no_{chosen(s)[0]}", "None of the sensors that method joint is chosen for has readings."
     result = {"calibration": calibration_rows(rows), "covariance": covariance_table(fit.covariance)}
-    if not any(codes["gyroscope"]):
+    full, _, covariance, _ = _triad(fit, "gyroscope")
+    if not any(_judged("gyroscope", fit, np.diagonal(full), covariance, s)):
         result["attitude"] = _attitude_table(fit, tables, axes)
     return StageResult(result, "refused" if every else "ok", first, reason, measured)
 
@@ -292,7 +304,7 @@ def _measured(fit: JointFit, axes: Array) -> dict[str, Any]:
         "gyro_walk_deg_per_sqrt_s": float(np.degrees(np.sqrt(fit.levels.walk))),
         "gyro_noise_share": gyro_noise_share(fit),
         "translation_rms_mps2": float(np.sqrt(3.0) * fit.levels.strength),
-        "advice": advice(fit.model, fit.state, fit.layout, fit.covariance),
+        "advice": advice(fit.model, fit.state, fit.layout, fit.covariance, axes),
     }
     if "dip" in fit.layout:
         own = fit.layout["dip"].start

@@ -8,7 +8,7 @@ from typing import Any
 import polars as pl
 
 from fieldcal.stages.warm_up import METHOD as WARM_UP
-from flows.present_flight import QUANTITIES, is_consequence, sync_sentence
+from flows.present_flight import QUANTITIES, advised, is_consequence, sync_sentence
 from flows.report import flight_figures as draw
 from flows.report.flight_curves import Curves, curves
 from flows.report.flight_data import FlightData
@@ -97,6 +97,7 @@ def _refusals(data: FlightData) -> list[Part]:
         if row["status"] == "ok" and row["reason_code"] and row["measured"].get("reason") != flight["reason"]:
             noted.setdefault(str(row["measured"].get("reason") or row["reason_code"]), []).append(row["stage"])
     parts += [Text(f"{', '.join(stages)}: {reason}") for reason, stages in noted.items()]
+    parts += [Text(sentence) for sentence in advised(data.run) if not any(sentence in reason for reason in noted)]
     return parts or [Text("Nothing was refused, and the log was read whole.")]
 
 
