@@ -15,7 +15,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fieldcal.errors import EstimationError
-from fieldcal.joint_chain import GRADIENT, SENSORS, Joints, Normal, Probe, add_joints, joint_squares, solve_scaled
+from fieldcal.joint_chain import (
+    BRIDGE,
+    GRADIENT,
+    RIGHTS,
+    SENSORS,
+    Joints,
+    Normal,
+    Probe,
+    add_joints,
+    joint_squares,
+    solve_scaled,
+)
 from fieldcal.joint_covariance import covariance, inverse_information
 from fieldcal.joint_model import (
     SENSED,
@@ -159,7 +170,7 @@ def _iterate(
     knots' response N_xx⁻¹N_xθ."""
     layout, p = layout_of(model, dip=dip, lever_arm=lever_arm)
     knots, prior = model.knots, _Prior.at(model, state, layout, p)
-    probe = Probe.draw(len(model.at), 3 * len(model.rows), len(knots.index))
+    probe = Probe.draw(knots, model.readings.t, model.at, 3 * len(model.rows))
     path = trajectory(model, state)
     residual = residuals(model, state, path)
     levels = levels or _first_levels(model, state, path, residual)
@@ -170,10 +181,13 @@ def _iterate(
         add_joints(normal, knots, joints, probe)
         prior.add(normal, state, layout)
         eliminated, information, gradient = normal.eliminate()
-        gradient[layout["gyroscope"].start + np.arange(3), 0] += _logged_units(model, state, path, levels.walk)
+        own = layout["gyroscope"].start + np.arange(3)
+        gradient[own, GRADIENT] += _logged_units(model, state, path, levels.walk)
+        within = levels.walk * _within_intervals(model, state, layout, reaction, eliminated[:, :, p + BRIDGE])
+        gradient[:, GRADIENT] += within
         if "accelerometer" in layout:
             own = layout["accelerometer"].start + np.arange(3)
-            gradient[own, 0] += _integrated_translation(model, state, reaction, eliminated[:, :, p + SENSORS])
+            gradient[own, GRADIENT] += _integrated_translation(model, state, reaction, eliminated[:, :, p + SENSORS])
         theta = solve_scaled(information, gradient)
         response = eliminated[:, :, p:] - eliminated[:, :, :p] @ theta
         step, change = response[:, :, GRADIENT], theta[:, GRADIENT]
@@ -183,7 +197,8 @@ def _iterate(
         residual = residuals(model, state, path)
         if not np.isfinite(residual).all():
             break
-        absorbed = np.einsum("kcr,kc->r", reaction[0], response[:, SENSED, SENSORS]) + reaction[1].T @ theta[:, SENSORS]
+        own_knots, own_theta = (x[..., : residual.shape[1]] for x in (reaction[0], reaction[1][:p]))
+        absorbed = np.einsum("kcr,kc->r", own_knots, response[:, SENSED, SENSORS]) + own_theta.T @ theta[:, SENSORS]
         joints = replace(joints, jump=path.jump, motion=state.motion)
         squares = joint_squares(knots, joints, response, theta, probe)
         renewed = _levels(model, residual, levels, absorbed, squares, MOST_WALK * gyro_walk(model, state))
@@ -218,8 +233,8 @@ def _normal_equations(
 ) -> tuple[Normal, Array, tuple[Array, Array]]:
     """Those of the sensors; ∂(integrated attitude)/∂θ (K−1, 3, p); and every row's own reaction to the probe."""
     knots, rows = len(model.knots.index), 3 * len(model.rows)
-    normal = Normal.empty(knots, p, 4)
-    reaction = np.zeros((knots, len(SENSED), rows)), np.zeros((p, rows))
+    normal = Normal.empty(knots, p, len(RIGHTS))
+    reaction = np.zeros((knots, len(SENSED), 2 * rows + 3)), np.zeros((p + 1, 2 * rows + 3))
     moved = np.zeros((knots, 3, p))
     whitening = _whitening(weight, levels)
     chunk: Rows
@@ -312,12 +327,15 @@ def _unsettled(before: Levels, after: Levels, squares: Array) -> float:
 
 
 def _robust_weight(model: Model, residual: Array, levels: Levels) -> Array:
-    """Redescending weights (m, r): 1 up to CLIP standard deviations of the reading, (CLIP/d)² beyond, 0 for none."""
+    """Redescending weights (m, r): 1 up to CLIP standard deviations of the reading, (CLIP/d)⁴ beyond, 0 for none.
+
+    With the square alone a wrong reading adds CLIP² to its variance, however far off, and six in a hundred of them
+    inflate that until none is an outlier."""
     out = np.empty_like(residual)
     for i, name in enumerate(model.rows):
         row = slice(3 * i, 3 * i + 3)
         square = np.sum(residual[:, row] ** 2 / levels.variance[row], axis=1)
-        weight = np.minimum(1.0, CLIP**2 / np.maximum(square, 1e-12)) * model.triads[name].known
+        weight = np.minimum(1.0, CLIP**2 / np.maximum(square, 1e-12)) ** 2 * model.triads[name].known
         out[:, row] = weight[:, None]
     return out
 
@@ -343,6 +361,23 @@ def _logged_units(model: Model, state: State, path: Trajectory, walk: float) -> 
     square = np.sum(jump**2 / (walk * knots.interval_s)[:, None], axis=0)
     # Noise makes one each; more is misfit that the walk's bound keeps from being noise, and no reason to move.
     return np.asarray(np.minimum(square, knots.joined.sum()) / state.values["gyroscope"][:3])
+
+
+def _within_intervals(
+    model: Model, state: State, layout: Mapping[str, slice], reaction: tuple[Array, Array], response: Array
+) -> Array:
+    """Gradient (p,), for a walk of one, that undoes what gyroscope noise within an interval does to scales.
+
+    Between knots the attitude is the integrated one: its noise is in the rows' residuals, in their sensitivity to the
+    gyroscope's λ_i, and in the vector predicted for them. The score lacks tr_i/λ_i of a gyroscope's axis and has
+    tr_j/λ_j of a row j too much, traces of the whitened rows' covariance, knots eliminated."""
+    rows = 3 * len(model.rows)
+    left = np.maximum(reaction[1][-1] - np.einsum("kci,kc->i", reaction[0], response[:, SENSED]), 0.0)[rows:]
+    out = np.zeros(len(reaction[1]) - 1)
+    for i, name in enumerate(("gyroscope", *model.rows)):
+        own = layout[name].start + np.arange(3)
+        out[own] = (1.0 if i == 0 else -1.0) * left[3 * i : 3 * i + 3] / state.values[name][:3]
+    return out
 
 
 def _integrated_translation(model: Model, state: State, reaction: tuple[Array, Array], response: Array) -> Array:
