@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fieldcal.joint_chain import GRADIENT, SENSORS, Knots, Normal, Probe
+from fieldcal.joint_chain import BRIDGE, GRADIENT, SENSORS, Knots, Normal, Probe
 from fieldcal.joint_record import CROSS, OPTIONAL, TERMS, Model, State, corrected
 from fieldcal.rotation import (
     Array,
@@ -70,12 +70,13 @@ def _since_knots(knots: Knots, steps: Array) -> tuple[Array, Array]:
 @dataclass(frozen=True)
 class Rows:
     """Residuals of samples `own` and what moves them, in units of x: `residual` (m, r), `by_knot` (m, r, 6) for
-    attitude (3) and acceleration (3), `by_parameter` (m, r, p)."""
+    attitude (3) and acceleration (3), `by_parameter` (m, r, p), `by_rotation` (m, r, 3) about the body's axes."""
 
     own: slice
     residual: Array
     by_knot: Array
     by_parameter: Array
+    by_rotation: Array
 
 
 def lever_arm_geometry(model: Model, state: State, own: slice) -> Array:
@@ -197,7 +198,7 @@ def sensitivities(
                     by_parameter[:, row, layout["lever_arm"]] = -sign * gain * lever_arm_geometry(model, state, own)
         end = np.zeros((ties.stop - ties.start, 3, parameters))
         end[:, :, by_gyroscope] = ends
-        yield ties, Rows(own, residual, by_knot, by_parameter), end
+        yield ties, Rows(own, residual, by_knot, by_parameter, by_knot[..., :3] @ turn.transpose(0, 2, 1)), end
 
 
 def _turned_by_gyroscope(
@@ -240,11 +241,13 @@ def accumulate(
 ) -> None:
     """Add a chunk's rows, whitened by `weight` (m, r) = 1/σ² with robust weights in, to the normal equations.
 
-    `groups` ((K, 6, r), (p, r)) collect each row's own reaction to the probe."""
+    `groups` ((K, 6, 2r + 3), (p + 1, 2r + 3)) collect what reacts to the probes, at knots and parameters: each row to
+    its own sign (r), and to gyroscope noise within an interval the rows together, by body axis (3), and each row (r);
+    the last line is a reaction's product with all that react to the same noise."""
     p, (m, r) = len(normal.parameters), weight.shape
     root = np.sqrt(weight)
     share = model.knots.share[model.at[rows.own], None, None]
-    met = np.empty((m + 1, r, 12 + p + 1))
+    met = np.empty((m + 1, r, 12 + p + 4))
     met[m] = 0.0  # one row of nothing, to fill shorter intervals with
     before, after, given = met[:m, :, :6], met[:m, :, 6:12], met[:m, :, 12:]
     np.multiply(rows.by_knot, root[..., None], out=before)
@@ -252,26 +255,34 @@ def accumulate(
     np.subtract(before, after, out=before)
     np.multiply(rows.by_parameter, root[..., None], out=given[..., :p])
     np.multiply(rows.residual, root, out=given[..., p])
-    by_interval = np.take(met, _padded(model, rows.own, ties), axis=0).reshape(ties.stop - ties.start, -1, 13 + p)
-    product = by_interval[..., :12].transpose(0, 2, 1) @ by_interval  # (knots, 12, 13 + p)
-    flat = given.reshape(-1, p + 1)
+    np.multiply(rows.by_rotation * root[..., None], probe.bridge[rows.own, None], out=given[..., p + 1 :])
+    by_interval = np.take(met, _padded(model, rows.own, ties), axis=0).reshape(ties.stop - ties.start, -1, 16 + p)
+    product = by_interval[..., :12].transpose(0, 2, 1) @ by_interval  # (knots, 12, 16 + p)
+    flat = given.reshape(-1, p + 4)
     total = flat.T @ flat
+    bridge = given[..., p + 1 :].sum(axis=2)
+    signs = probe.sensors[rows.own] * (root > 0)
+    alone = np.stack([signs, bridge], axis=2)[:, :, None, :]
     normal.parameters += total[:p, :p]
     normal.parameters_right[:, GRADIENT] += total[:p, p]
-    reaction = met[:m] * (probe.sensors[rows.own] * (root > 0))[..., None]
-    own = reaction[..., 12:-1].sum(axis=0).T
+    own = (flat[:, :p].reshape(m, r, p) * signs[..., None]).sum(axis=0).T
     normal.parameters_right[:, SENSORS] += own.sum(axis=1)
-    groups[1][:] += own
-    pulled = sums_by_interval(model, reaction[..., :12].reshape(m, -1), rows.own, ties).reshape(-1, r, 12)
-    pulled = pulled.transpose(0, 2, 1)
+    normal.parameters_right[:, BRIDGE] += total[:p, p + 1 :].sum(axis=1)
+    groups[1][:p, :r] += own
+    groups[1][p, r:] += np.r_[total[p + 1 :, p + 1 :].sum(axis=1), np.sum(bridge**2, axis=0)]
+    pulled = sums_by_interval(model, (met[:m, :, :12, None] * alone).reshape(m, -1), rows.own, ties)
+    pulled = pulled.reshape(-1, r, 12, 2).transpose(0, 2, 1, 3)
+    pulled = np.concatenate([pulled[..., 0], product[:, :, 13 + p :], pulled[..., 1]], axis=2)
     # Chain blocks: an interval's rows pull at the knot before it and, where the record goes on, at the one after.
     last = min(ties.stop, len(normal.diagonal) - 1)
     inside, following = slice(0, last - ties.start), slice(ties.start + 1, last + 1)
     for knot, part, here in ((ties, slice(0, 6), slice(None)), (following, slice(6, 12), inside)):
         groups[0][knot] += pulled[here, part]
-        right = np.concatenate([product[here, part, 12:], pulled[here, part].sum(axis=2, keepdims=True)], axis=2)
+        probes = np.stack([pulled[here, part, :r].sum(axis=2), pulled[here, part, r : r + 3].sum(axis=2)], axis=2)
         for state, own_part in BLOCKS:
-            normal.right[knot, state, : p + 2] += right[:, own_part]
+            normal.right[knot, state, : p + 1] += product[here, part, 12 : 13 + p][:, own_part]
+            normal.right[knot, state, p + SENSORS] += probes[:, own_part, 0]
+            normal.right[knot, state, p + BRIDGE] += probes[:, own_part, 1]
             for other, other_part in BLOCKS:
                 columns = slice(part.start + other_part.start, part.start + other_part.stop)
                 normal.diagonal[knot, state, other] += product[here, part, columns][:, own_part]

@@ -91,7 +91,7 @@ def _scores(fit: JointFit) -> dict[str, float]:
     names = candidates(fit)
     model, state = fit.model, with_zeros(fit.state, names)
     layout, p = layout_of(model, state.values, dip="dip" in fit.layout, lever_arm="lever_arm" in fit.layout)
-    probe = Probe.draw(len(model.at), 3 * len(model.rows), len(model.knots.index))
+    probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.rows))
     normal, _, _ = linearised(model, state, fit.path, layout, p, fit.weight, fit.levels, probe, fit.vps)
     _, information, gradient = normal.eliminate()
     own = np.concatenate([np.arange(p)[layout[name]] for name in names])
@@ -167,7 +167,7 @@ def _predicted(
         reference = replace(constants.vps, used=vps.used, sigma_rad=sigma)
     own = {name: v for name, v in state.values.items() if name in TERMS or name in PARAMETERS}
     layout, p = layout_of(model, own, dip=False, lever_arm=False)
-    probe = Probe.draw(len(model.at), 3 * len(model.rows), len(model.knots.index))
+    probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.rows))
     for _ in range(PREDICT_ITERATIONS):
         path = trajectory(model, state)
         weight = robust_weight(model, residuals(model, state, path), levels)

@@ -65,7 +65,8 @@ class VpsRecord:
         turned = to_rotation_vector(multiply(q[1:], conjugate(q[:-1])))
         noise = float(np.max(white_noise_sigma(np.cumsum(turned, axis=0))))
         none = np.array([0.0, 0.0, 0.0, 1.0])
-        record = cls(t, q, block_rates(t, q, max_gap_s), max_gap_s, clock, none, none, np.ones(len(model.knots.index), dtype=bool), noise)
+        every = np.ones(len(model.knots.index), dtype=bool)
+        record = cls(t, q, block_rates(t, q, max_gap_s), max_gap_s, clock, none, none, every, noise)
         at_knots, known = record._read(model, np.zeros(2))
         if known.sum() < MIN_POSES:
             return None
