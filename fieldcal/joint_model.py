@@ -109,7 +109,8 @@ def _sensed(
     sensed, vector = _sensed_at_once(model, state, own, turn, name)
     delay = state.values.get(f"{name}_delay")
     if delay is not None:
-        sensed = sensed + delay * np.cross(_slow_rate(model, path, own), sensed)
+        turned = from_rotation_vector(-delay * _slow_rate(model, path, own))
+        sensed = np.einsum("nij,nj->ni", body_from_inertial(turned), sensed)
     return sensed, vector
 
 

@@ -1,5 +1,5 @@
-"""What the joint estimator's scores lack beside the quadratic form, as residuals are in logged units and noise is in the
-sensitivities too: corrections of the gradient on the triads' scales."""
+"""What the joint estimator's scores lack beside the quadratic form, as residuals are in logged units and noise is in
+the sensitivities too: corrections of the gradient on the triads' scales."""
 
 from __future__ import annotations
 
