@@ -25,7 +25,7 @@ from fieldcal.joint import JointFit, fit_joint
 from fieldcal.joint_covariance import advice
 from fieldcal.joint_record import TERMS, Readings
 from fieldcal.results import StageResult, fatal_fault, triad_rows
-from fieldcal.rotation import Array, from_matrix, multiply
+from fieldcal.rotation import Array, body_from_inertial, from_matrix, multiply
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Settings, Tables, mean_temperature, reference_reading, refusal
 from fieldcal.stages.joint_reference import Poses, poses_of, with_poses
@@ -258,11 +258,14 @@ def _judged(name: str, fit: JointFit, scale: Array, covariance: Array, s: Settin
     relative = np.sqrt(np.diagonal(covariance)[:3]) / np.abs(scale)
     polarity = np.asarray(s["polarity"][name], dtype=float)
     nominal = s["nominal_scale"][name]
+    noisy = axis_noise_share(fit) > MAX_GYRO_NOISE_SHARE if name == "gyroscope" else np.zeros(3, dtype=bool)
     out: list[str | None] = []
     for i in range(3):
         ratio = 1.0 if nominal is None else abs(scale[i] / nominal[i])
         if not relative[i] <= limit:
             out.append("scale_uncertain")
+        elif noisy[i]:
+            out.append("axis_not_turned")
         elif np.sign(scale[i]) != polarity[i]:
             out.append("polarity_contradiction")
         else:
@@ -275,6 +278,18 @@ def gyro_noise_share(fit: JointFit) -> float:
     turned = np.sqrt(np.mean(np.sum(fit.path.rate**2, axis=1))) * fit.model.knots.interval_s
     jumped = np.linalg.norm(fit.path.jump, axis=1)
     return float(np.sqrt(np.mean(jumped**2) / np.mean(turned**2)))
+
+
+def axis_noise_share(fit: JointFit) -> Array:
+    """The same of each gyroscope axis (3,). Of an axis about which the vehicle hardly turned noise is all there is, and
+    a regressor that is noise says nothing of its scale, however small its sd."""
+    knots, q = fit.model.knots, fit.state.q[:-1]
+    jump = np.einsum("kij,kj->ki", body_from_inertial(q), fit.path.jump)[knots.joined]
+    samples = np.diff(knots.index)
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(fit.path.rate, axis=0)])
+    mean = (total[knots.index[1:]] - total[knots.index[:-1]]) / samples[:, None]
+    turned = (mean * knots.interval_s[:, None])[knots.joined]
+    return np.asarray(np.sqrt(np.mean(jump**2, axis=0) / np.mean(turned**2, axis=0)))
 
 
 def misfit(fit: JointFit, name: str) -> float:
@@ -303,6 +318,7 @@ def _measured(fit: JointFit, axes: Array) -> dict[str, Any]:
         "misfit": {name: misfit(fit, name) for name in fit.model.rows},
         "gyro_walk_deg_per_sqrt_s": float(np.degrees(np.sqrt(fit.levels.walk))),
         "gyro_noise_share": gyro_noise_share(fit),
+        "axis_noise_share": [float(v) for v in axis_noise_share(fit)],
         "translation_rms_mps2": float(np.sqrt(3.0) * fit.levels.strength),
         "advice": advice(fit.model, fit.state, fit.layout, fit.covariance, axes),
     }
