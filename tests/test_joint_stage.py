@@ -78,6 +78,13 @@ def test_the_rest_of_the_flight_is_predicted(moving: tuple[Recording, dict[str, 
     assert smoothed["tic"][0] < 0.045
 
 
+def test_without_a_vps_the_rest_is_held_against_the_joint_attitude() -> None:
+    """Attitudes only: between readings of the vectors that attitude turns as the gyroscope itself says."""
+    fit = flown(simulate(seed=36, vps=False))["verify"].tables["fit"].filter(pl.col("sample") == "held_out")
+    assert fit.select("quantity", "method", "reference").rows() == [("attitude_propagated", "joint", "joint")]
+    assert 0.0 < fit["rms"][0] < 5.0  # degrees: gyroscope noise over 10 s
+
+
 def test_turning_about_one_axis_alone_is_refused_with_numbers() -> None:
     r = simulate(seed=32, duration_s=30.0)
     frames = signals(r)
