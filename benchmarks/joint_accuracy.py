@@ -24,7 +24,7 @@ import polars as pl
 from fieldcal import joint_start
 from fieldcal.frames import AXES, QUATERNION, constants, matrix
 from fieldcal.joint import fit_joint
-from fieldcal.joint_model import Readings
+from fieldcal.joint_record import Readings
 from fieldcal.pipeline import run_flight
 from fieldcal.results import StageResult
 from fieldcal.rotation import angle_between

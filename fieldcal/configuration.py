@@ -76,11 +76,14 @@ class McapMap:
 
 @dataclass(frozen=True)
 class Vehicle:
-    """All that is configured of one vehicle, defaults and profile worked in. None: the log decides."""
+    """All that is configured of one vehicle, defaults and profile worked in. None: the log decides.
+
+    `method` is one name for all sensors, or sensor → name where they differ.
+    """
 
     vehicle_id: str
     imu_id: str
-    method: str
+    method: str | dict[str, str]
     profile: str
     world: str | None
     body: str | None
@@ -190,6 +193,18 @@ def _per_sensor(one: Callable[[Any, Place], Any], value: Any, place: Place) -> d
     return {sensor: one(item, place / sensor) for sensor, item in check.table(value, place, SENSORS).items()}
 
 
+def _method(value: Any, place: Place) -> dict[str, str]:
+    """One name for all sensors, or a table of them."""
+    if isinstance(value, dict):
+        return _per_sensor(partial(check.choice, allowed=METHODS), value, place)
+    return dict.fromkeys(SENSORS, check.choice(value, place, METHODS))
+
+
+def _one_method(named: Mapping[str, str]) -> str | dict[str, str]:
+    every = {sensor: named.get(sensor, METHODS[0]) for sensor in SENSORS}
+    return every[SENSORS[0]] if len(set(every.values())) == 1 else every
+
+
 def _units(value: Any, place: Place) -> dict[str, str]:
     raw = check.table(value, place, SENSORS)
     return {sensor: check.choice(unit, place / sensor, UNITS[sensor]) for sensor, unit in raw.items()}
@@ -283,7 +298,7 @@ _MCAP_KEYS: dict[str, Callable[[Any, Place], Any]] = {
 }
 _VEHICLE_KEYS: dict[str, Callable[[Any, Place], Any]] = {
     "imu_id": check.text,
-    "method": partial(check.choice, allowed=METHODS),
+    "method": _method,
     "profile": partial(check.choice, allowed=PROFILES),
     "world": partial(check.choice, allowed=("ned", "enu")),
     "body": partial(check.choice, allowed=("frd", "flu")),
@@ -321,7 +336,7 @@ def _vehicle(vehicle_id: str, raw: Mapping[str, Any]) -> Vehicle:
     return Vehicle(
         vehicle_id=vehicle_id,
         imu_id=raw.get("imu_id", vehicle_id),
-        method=raw.get("method", METHODS[0]),
+        method=_one_method(raw.get("method", {})),
         profile=profile,
         world=raw.get("world"),
         body=raw.get("body"),

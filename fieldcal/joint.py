@@ -15,23 +15,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fieldcal.errors import EstimationError
-from fieldcal.joint_chain import GRADIENT, SENSORS, Joints, Normal, Probe, add_joints, joint_squares, solve_scaled
-from fieldcal.joint_covariance import covariance, inverse_information
-from fieldcal.joint_model import (
-    SENSED,
-    TRIADS,
-    Model,
-    Rows,
-    State,
-    Trajectory,
-    accumulate,
-    layout_of,
-    residuals,
-    sensitivities,
-    trajectory,
+from fieldcal.joint_chain import (
+    BRIDGE,
+    GRADIENT,
+    RIGHTS,
+    SENSORS,
+    Joints,
+    Normal,
+    Probe,
+    add_joints,
+    joint_squares,
+    solve_scaled,
 )
+from fieldcal.joint_covariance import covariance, inverse_information
+from fieldcal.joint_model import SENSED, Rows, Trajectory, accumulate, layout_of, residuals, sensitivities, trajectory
+from fieldcal.joint_record import CROSS, TRIADS, Model, State, off_diagonal
+from fieldcal.joint_scores import integrated_translation, logged_units, within_intervals
 from fieldcal.joint_vps import VpsRecord
-from fieldcal.rotation import Array, body_from_inertial
+from fieldcal.rotation import Array
 from fieldcal.statistics import robust_sigma, white_noise_sigma
 
 # Residual length, sd of a three-axis reading, beyond which a reading loses influence: χ²₃ passes it once in a thousand.
@@ -90,10 +91,26 @@ class JointFit:
     vps: VpsRecord | None = None
 
     def constants(self, name: str) -> tuple[Array, Array, Array]:
-        """(λ (3,), b (3,), covariance (6, 6)) of a triad in logged units."""
+        """(λ (3,), b (3,), covariance (6, 6)) of a triad without cross-axis terms, logged units."""
         transform = self.model.triads[name].to_logged()
         value, own = transform @ self.state.values[name], self.layout[name]
         return value[:3], value[3:], transform @ self.covariance[own, own] @ transform.T
+
+    def full_constants(self, name: str) -> tuple[Array, Array, Array]:
+        """(Λ (3, 3), b (3,), covariance (12, 12) of Λ by rows and b) of a triad with cross-axis terms, logged units."""
+        triad, own, scaled = self.model.triads[name], self.layout[name], self.state.values[name]
+        cross = f"{name}_cross"
+        e = off_diagonal(name, self.state.values[cross]) if cross in self.layout else np.zeros((3, 3))
+        matrix = scaled[:3, None] * (np.eye(3) + e) / triad.spread
+        jacobian = np.zeros((12, len(self.covariance)))
+        for i in range(3):
+            jacobian[3 * i : 3 * i + 3, own.start + i] = matrix[i] / scaled[i]
+            jacobian[9 + i, own.start + 3 + i] = 1.0
+        if cross in self.layout:
+            for k, (i, j) in enumerate(CROSS[name]):
+                jacobian[3 * i + j, self.layout[cross].start + k] = scaled[i] / triad.spread[j]
+        jacobian[9:] -= np.einsum("ijp,j->ip", jacobian[:9].reshape(3, 3, -1), triad.centre)
+        return matrix, scaled[3:] - matrix @ triad.centre, jacobian @ self.covariance @ jacobian.T
 
 
 def fit_joint(
@@ -133,7 +150,7 @@ def fit_joint(
     -----
     The likelihood is maximised over the attitudes, with every residual in logged units: that is consistent (a rate or
     a length in SI units would shrink with its scale). Over the translation, which has a prior of its own, it is
-    integrated; what that adds to the accelerometer's gradient is `_integrated_translation`.
+    integrated; what that adds to the accelerometer's gradient is `integrated_translation`.
 
     It cannot see what moves all triads together with the body: a common rotation of the axes, or a field that turns
     with the vehicle other than hard iron.
@@ -175,23 +192,22 @@ def _iterate(
     knots' response N_xx⁻¹N_xθ."""
     layout, p = layout_of(model, state.values, dip=dip, lever_arm=lever_arm)
     knots, prior = model.knots, _Prior.at(model, state, layout, p)
-    probe = Probe.draw(len(model.at), 3 * len(model.rows), len(knots.index))
+    probe = Probe.draw(knots, model.readings.t, model.at, 3 * len(model.rows))
     path = trajectory(model, state)
     residual = residuals(model, state, path)
     levels = levels or _first_levels(model, state, path, residual)
     for iteration in range(1, MAX_ITERATIONS + 1):
-        weight = _robust_weight(model, residual, levels)
-        normal, moved, reaction = _normal_equations(model, state, path, layout, p, weight, levels, probe)
-        joints = Joints(path.jump, moved, levels.walk, state.motion, levels.strength)
-        add_joints(normal, knots, joints, probe)
-        if vps is not None:
-            vps.add(normal, model, state, path, layout)
+        weight = robust_weight(model, residual, levels)
+        normal, joints, reaction = linearised(model, state, path, layout, p, weight, levels, probe, vps)
         prior.add(normal, state, layout)
         eliminated, information, gradient = normal.eliminate()
-        gradient[layout["gyroscope"].start + np.arange(3), 0] += _logged_units(model, state, path, levels.walk)
+        own = layout["gyroscope"].start + np.arange(3)
+        gradient[own, GRADIENT] += logged_units(model, state, path, levels.walk)
+        within = levels.walk * within_intervals(model, state, layout, reaction, eliminated[:, :, p + BRIDGE])
+        gradient[:, GRADIENT] += within
         if "accelerometer" in layout:
             own = layout["accelerometer"].start + np.arange(3)
-            gradient[own, 0] += _integrated_translation(model, state, reaction, eliminated[:, :, p + SENSORS])
+            gradient[own, GRADIENT] += integrated_translation(model, state, reaction, eliminated[:, :, p + SENSORS])
         theta = solve_scaled(information, gradient)
         response = eliminated[:, :, p:] - eliminated[:, :, :p] @ theta
         step, change = response[:, :, GRADIENT], theta[:, GRADIENT]
@@ -201,7 +217,8 @@ def _iterate(
         residual = residuals(model, state, path)
         if not np.isfinite(residual).all():
             break
-        absorbed = np.einsum("kcr,kc->r", reaction[0], response[:, SENSED, SENSORS]) + reaction[1].T @ theta[:, SENSORS]
+        own_knots, own_theta = (x[..., : residual.shape[1]] for x in (reaction[0], reaction[1][:p]))
+        absorbed = np.einsum("kcr,kc->r", own_knots, response[:, SENSED, SENSORS]) + own_theta.T @ theta[:, SENSORS]
         joints = replace(joints, jump=path.jump, motion=state.motion)
         squares = joint_squares(knots, joints, response, theta, probe)
         renewed = _levels(model, residual, levels, absorbed, squares, MOST_WALK * gyro_walk(model, state))
@@ -217,6 +234,26 @@ def _iterate(
         "The joint estimate found no minimum: the readings contradict each other or the start is too far off.",
         {"iterations": iteration},
     )
+
+
+def linearised(
+    model: Model,
+    state: State,
+    path: Trajectory,
+    layout: Mapping[str, slice],
+    p: int,
+    weight: Array,
+    levels: Levels,
+    probe: Probe,
+    vps: VpsRecord | None,
+) -> tuple[Normal, Joints, tuple[Array, Array]]:
+    """Normal equations of everything but the prior, the joints in them, and every row's own reaction to the probe."""
+    normal, moved, reaction = _normal_equations(model, state, path, layout, p, weight, levels, probe)
+    joints = Joints(path.jump, moved, levels.walk, state.motion, levels.strength)
+    add_joints(normal, model.knots, joints, probe)
+    if vps is not None:
+        vps.add(normal, model, state, path, layout)
+    return normal, joints, reaction
 
 
 def _whitening(weight: Array, levels: Levels) -> Array:
@@ -236,8 +273,8 @@ def _normal_equations(
 ) -> tuple[Normal, Array, tuple[Array, Array]]:
     """Those of the sensors; ∂(integrated attitude)/∂θ (K−1, 3, p); and every row's own reaction to the probe."""
     knots, rows = len(model.knots.index), 3 * len(model.rows)
-    normal = Normal.empty(knots, p, 4)
-    reaction = np.zeros((knots, len(SENSED), rows)), np.zeros((p, rows))
+    normal = Normal.empty(knots, p, len(RIGHTS))
+    reaction = np.zeros((knots, len(SENSED), 2 * rows + 3)), np.zeros((p + 1, 2 * rows + 3))
     moved = np.zeros((knots, 3, p))
     whitening = _whitening(weight, levels)
     chunk: Rows
@@ -302,7 +339,7 @@ def gyro_walk(model: Model, state: State) -> float:
 
 def _levels(model: Model, residual: Array, levels: Levels, absorbed: Array, squares: Array, most_walk: float) -> Levels:
     """Variance components: squares over what the unknowns leave of their number."""
-    weight = _robust_weight(model, residual, levels)
+    weight = robust_weight(model, residual, levels)
     count = weight.sum(axis=0)
     left = np.maximum(count - levels.colour * absorbed, 0.05 * count)
     variance = np.maximum(np.sum(weight * residual**2, axis=0) / left, LEAST_VARIANCE)
@@ -329,13 +366,16 @@ def _unsettled(before: Levels, after: Levels, squares: Array) -> float:
     return float(np.max(change))
 
 
-def _robust_weight(model: Model, residual: Array, levels: Levels) -> Array:
-    """Redescending weights (m, r): 1 up to CLIP standard deviations of the reading, (CLIP/d)² beyond, 0 for none."""
+def robust_weight(model: Model, residual: Array, levels: Levels) -> Array:
+    """Redescending weights (m, r): 1 up to CLIP standard deviations of the reading, (CLIP/d)⁴ beyond, 0 for none.
+
+    With the square alone a wrong reading adds CLIP² to its variance, however far off, and six in a hundred of them
+    inflate that until none is an outlier."""
     out = np.empty_like(residual)
     for i, name in enumerate(model.rows):
         row = slice(3 * i, 3 * i + 3)
         square = np.sum(residual[:, row] ** 2 / levels.variance[row], axis=1)
-        weight = np.minimum(1.0, CLIP**2 / np.maximum(square, 1e-12)) * model.triads[name].known
+        weight = np.minimum(1.0, CLIP**2 / np.maximum(square, 1e-12)) ** 2 * model.triads[name].known
         out[:, row] = weight[:, None]
     return out
 
@@ -349,26 +389,3 @@ def _colour(model: Model, residual: Array, weight: Array) -> Array:
     for lag in range(1, lags + 1):
         colour += 2.0 * (1.0 - lag / (lags + 1)) * np.sum(x[lag:] * x[:-lag], axis=0) / zero
     return np.clip(np.repeat(colour.reshape(-1, 3).mean(axis=1), 3), 1.0, 10.0)
-
-
-def _logged_units(model: Model, state: State, path: Trajectory, walk: float) -> Array:
-    """Gradient (3,) on the gyroscope's λ' that makes its residual one in logged units.
-
-    A jump c of the attitude is gyroscope noise of c/λ logged units; as an angle it would shrink with λ, and with it the
-    rates (the attenuation of a noisy regressor). ∂/∂λ_i of −½Σ(c_i/λ_i)²/σ² is Σc_i²/(λ_i walk Δt)."""
-    knots = model.knots
-    jump = np.einsum("kij,kj->ki", body_from_inertial(state.q[:-1]), path.jump)
-    square = np.sum(jump**2 / (walk * knots.interval_s)[:, None], axis=0)
-    # Noise makes one each; more is misfit that the walk's bound keeps from being noise, and no reason to move.
-    return np.asarray(np.minimum(square, knots.joined.sum()) / state.values["gyroscope"][:3])
-
-
-def _integrated_translation(model: Model, state: State, reaction: tuple[Array, Array], response: Array) -> Array:
-    """Gradient (3,) on the accelerometer's λ' from integrating over the translation instead of maximising over it.
-
-    With V(λ) the logged readings' covariance, translation included, and H the attitudes' sensitivity, the score of a
-    likelihood maximised over the attitudes has the bias −½ tr[(HᵀV⁻¹H)⁻¹ HᵀV⁻¹ V_λ V⁻¹H]. Taken off, what is left
-    beside the quadratic form is tr_i/λ_i: the trace of row i's hat matrix that belongs to the translation."""
-    row = 3 * model.rows.index("accelerometer")
-    taken = np.einsum("kcr,kc->r", reaction[0][:, 3:, row : row + 3], response[:, SENSED[3:]])
-    return np.asarray(taken / state.values["accelerometer"][:3])

@@ -23,7 +23,7 @@ MOTION_HZ = 0.7
 ORDER = 3  # velocity, acceleration, jerk, scaled to m/s²
 STATES = 3 + 3 * ORDER  # attitude error first
 # Right-hand sides after the parameters: the gradient, and what the unknowns make of each group's probe.
-GRADIENT, SENSORS, JUMP, MOTION = range(4)
+GRADIENT, SENSORS, JUMP, MOTION, BRIDGE = RIGHTS = range(5)
 WEAK = 1e-2  # 1/rad²: keeps directions that nothing observes (heading without a magnetometer) from being singular
 
 
@@ -221,6 +221,14 @@ def _add_motion(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> N
         normal.right[:, 3:, p + column] += right.reshape(-1, 3 * ORDER)
 
 
+def whitened_joints(knots: Knots, joints: Joints) -> Array:
+    """Each interval's attitude jump and the translation's process noise in it, over their sd, (K−1, 3 + 9)."""
+    ahead, behind, _ = _process(knots, joints.strength)
+    y = joints.motion.reshape(-1, ORDER, 3)
+    jump = joints.jump * np.sqrt(knots.joined / (joints.walk * knots.interval_s))[:, None]
+    return np.hstack([jump, (ahead @ y[1:] - behind @ y[:-1]).reshape(len(jump), -1)])
+
+
 def joint_squares(knots: Knots, joints: Joints, state: Array, theta: Array, probe: Probe) -> Array:
     """(2, 3): for attitude jumps and for the translation, the whitened squares s, how many of them are free e = tr M,
     and tr M² for M = I − (what the unknowns absorb). ½(s − e) and ½ tr M² are score and information of the logarithm
@@ -248,16 +256,27 @@ def joint_squares(knots: Knots, joints: Joints, state: Array, theta: Array, prob
 @dataclass(frozen=True)
 class Probe:
     """Fixed random signs, one for each residual: pushed through the fit they measure how much of each group of
-    residuals the unknowns absorb (Monte-Carlo variance components: García-Cortés et al. 1992, Kusche 2003)."""
+    residuals the unknowns absorb (Monte-Carlo variance components: García-Cortés et al. 1992, Kusche 2003).
+
+    `bridge` is what gyroscope noise of unit density about each body axis makes of the attitude at every row, tied to
+    nothing at the knots on either side."""
 
     sensors: Array  # (n, rows)
     jump: Array  # (K−1, 3)
     motion: Array  # (K−1, 3, 3)
     start: Array  # (K, 3, 3)
+    bridge: Array  # (n, 3), √s
 
     @classmethod
-    def draw(cls, samples: int, rows: int, knots: int) -> Probe:
+    def draw(cls, knots: Knots, t: Array, at: np.ndarray, rows: int) -> Probe:
+        """For `rows` residuals at each of the samples `at` (m,) of `t` (n,)."""
         rng = np.random.default_rng(0)
-        shapes = ((samples, rows), (knots - 1, 3), (knots - 1, ORDER, 3), (knots, ORDER, 3))
-        signs = [rng.integers(0, 2, shape) * 2.0 - 1.0 for shape in shapes]
-        return cls(*signs)
+        k = len(knots.index)
+        shapes = ((len(at), rows), (k - 1, 3), (k - 1, ORDER, 3), (k, ORDER, 3), (len(t), 3))
+        sensors, jump, motion, start, noise = (rng.integers(0, 2, shape) * 2.0 - 1.0 for shape in shapes)
+        steps = 0.5 * (noise[1:] + noise[:-1]) * np.sqrt(np.diff(t))[:, None]  # trapezoidal, as it is integrated
+        walked = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        knot, share = knots.of_sample[at], knots.share[at, None]
+        after = np.minimum(knot + 1, k - 1)
+        bridge = walked[at] - (1.0 - share) * walked[knots.index[knot]] - share * walked[knots.index[after]]
+        return cls(sensors, jump, motion, start, bridge * np.r_[knots.joined, False][knot, None])

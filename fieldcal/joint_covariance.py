@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from fieldcal.joint_model import SENSED, Model, Rows, State, sums_by_interval
+from fieldcal.joint_model import SENSED, Rows, sums_by_interval
+from fieldcal.joint_record import Model, State
 from fieldcal.rotation import Array
 from fieldcal.statistics import coloured_information
 
@@ -75,16 +76,19 @@ def inverse_information(information: Array) -> Array:
     return np.asarray(np.linalg.pinv(information * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale))
 
 
-# Motion that shows a triad's constants: what to add when an axis stays uncertain.
-TURNS = {"x": "pitch", "y": "roll", "z": "roll and pitch"}
 WEAK_RELATIVE_SD = 0.01
+TURNS = ("roll", "pitch", "yaw")
+STEEP_RAD = np.pi / 4
+# Turns that swing gravity, or a steep field, along each body axis; and a level field.
+SWINGS = (("pitch",), ("roll",), ("roll", "pitch"))
+LEVEL_SWINGS = (("yaw",), ("yaw",), ("roll", "pitch"))
 
 
-def advice(model: Model, state: State, layout: Mapping[str, slice], covariance: Array) -> str:
-    """Which scales are weak and which motion would help, in a sentence; empty where all are within 1 %.
+def advice(model: Model, state: State, layout: Mapping[str, slice], covariance: Array, axes: Array) -> str:
+    """Which scales are weak and which motion would help, in a sentence or two; empty where all are within 1 %.
 
-    A vector triad's axis is seen when the sensed vector swings along it; a gyroscope's when the vehicle turns about
-    it."""
+    A gyroscope's axis is seen when the vehicle turns about it; a vector triad's when the sensed vector swings along it.
+    `axes` (3, 3) turns sensor axes into nose, starboard, underside."""
     weak = []
     for name, own in layout.items():
         if name not in model.triads:
@@ -94,11 +98,15 @@ def advice(model: Model, state: State, layout: Mapping[str, slice], covariance: 
         weak += [(float(sd), name, i) for i, sd in enumerate(relative) if sd > WEAK_RELATIVE_SD]
     if not weak:
         return ""
-    sd, name, axis = max(weak)
-    letter = "xyz"[axis]
+    (sd, name, axis), *others = sorted(weak, reverse=True)
+    body = int(np.argmax(np.abs(axes[:, axis])))
     if name == "gyroscope":
-        help_with = f"turn about {letter} by 60° either way, several times"
+        turns: tuple[str, ...] = (TURNS[body],)
     else:
-        vector = "gravity" if name == "accelerometer" else "the magnetic field"
-        help_with = f"tilt until {vector} lies along +{letter} and along −{letter}: 60° of {TURNS[letter]} either way"
-    return f"The {name}'s {letter} scale is the weakest (sd {100 * sd:.1f} %); to improve it, {help_with}."
+        level = name == "magnetometer" and abs(float(state.values["dip"][0])) < STEEP_RAD
+        turns = (LEVEL_SWINGS if level else SWINGS)[body]
+    told = f"The {name}'s {'xyz'[axis]} scale is the weakest (sd {100 * sd:.1f} %): add 60° of {' and of '.join(turns)}"
+    told += " either way, several times."
+    if others:
+        told += " Above 1 % too: " + ", ".join(f"{n} {'xyz'[i]} {100 * v:.1f} %" for v, n, i in others) + "."
+    return told

@@ -4,12 +4,12 @@ interval (see `joint` for the whole)."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from fieldcal.gyro_equation import from_centred
-from fieldcal.joint_chain import GRADIENT, SENSORS, Knots, Normal, Probe
+from fieldcal.joint_chain import BRIDGE, GRADIENT, SENSORS, Knots, Normal, Probe
+from fieldcal.joint_record import CROSS, OPTIONAL, TERMS, Model, State, corrected
 from fieldcal.rotation import (
     Array,
     body_from_inertial,
@@ -22,133 +22,10 @@ from fieldcal.rotation import (
 )
 
 CHUNK_ROWS = 8192
-MAX_TURN_RAD, MAX_AVERAGE_S = 0.1, 0.02
+RATE_SIDE_S = 0.03
 ACCELERATION = slice(3, 6)  # of a knot's translation
 SENSED = np.array([0, 1, 2, 6, 7, 8])  # of a knot's states: attitude and acceleration
 BLOCKS = ((slice(0, 3), slice(0, 3)), (slice(6, 9), slice(3, 6)))  # the same by slices: of the states, of SENSED
-TRIADS = ("gyroscope", "accelerometer", "magnetometer")
-# What a start may hold beside constants, and how many numbers that is (`joint_vps`).
-OPTIONAL = {"vps_clock": 2, "vps_world": 3, "vps_body": 3}
-
-
-@dataclass(frozen=True)
-class Readings:
-    """One record, every triad in the same sensor axes, logged units.
-
-    `t` (n,) s; `segment` (n,) contiguous stretches; `gyroscope` (n, 3) complete; `accelerometer`, `magnetometer` (n, 3)
-    with NaN where there is no reading, or None; `gravity_mps2` signed: negative for a specific-force accelerometer;
-    `field_ned` (3,) the configured local field; `turning` (2, n, 3) the gyroscope low-passed and its derivative, logged
-    units (for the lever arm)."""
-
-    t: Array
-    segment: np.ndarray
-    gyroscope: Array
-    accelerometer: Array | None
-    magnetometer: Array | None
-    gravity_mps2: float
-    field_ned: Array
-    turning: Array
-
-
-def stretches(segment: np.ndarray) -> list[tuple[int, int]]:
-    """Bounds [a, b) of the contiguous segments."""
-    starts = np.flatnonzero(np.r_[True, segment[1:] != segment[:-1]])
-    return list(zip(starts.tolist(), [*starts[1:].tolist(), len(segment)], strict=True))
-
-
-def averaging_side(readings: Readings, rate_radps: float) -> int:
-    """How many neighbours on either side a vector reading may be averaged with: while the vehicle turns by less than
-    MAX_TURN_RAD at `rate_radps` and both triads are complete."""
-    for x in (readings.accelerometer, readings.magnetometer):
-        if x is not None and not np.isfinite(x).all():
-            return 0
-    interval = float(np.median(np.diff(readings.t)))
-    longest = min(MAX_TURN_RAD / max(rate_radps, 1e-9), MAX_AVERAGE_S)
-    return max(0, int((longest / interval - 1.0) / 2.0))
-
-
-@dataclass(frozen=True)
-class Centred:
-    """A triad's readings as x = (logged − centre)/spread, so that its constants (λ', b') are of order one."""
-
-    x: Array
-    known: np.ndarray
-    centre: Array
-    spread: Array
-
-    @classmethod
-    def of(cls, logged: Array) -> Centred:
-        known = np.asarray(np.isfinite(logged).all(axis=1))
-        centre = logged[known].mean(axis=0)
-        spread = np.maximum(logged[known].std(axis=0), 1e-300)
-        return cls(np.where(known[:, None], (logged - centre) / spread, 0.0), known, centre, spread)
-
-    def averaged(self, at: np.ndarray, side: int) -> Centred:
-        """At samples `at` only, each the mean of itself and `side` neighbours on either side."""
-        x = sum(self.x[at + k] for k in range(-side, side + 1)) / (2 * side + 1)
-        return replace(self, x=np.asarray(x), known=self.known[at])
-
-    def scaled(self, scale: Array, bias: Array) -> Array:
-        """(λ', b') (6,) of constants in logged units."""
-        return np.concatenate([scale * self.spread, bias + scale * self.centre])
-
-    def to_logged(self) -> Array:
-        """(λ, b) = T (λ', b'), (6, 6)."""
-        return from_centred(self.centre, self.spread)
-
-
-@dataclass(frozen=True)
-class State:
-    """Everything unknown: knot attitudes `q` (K, 4) of the sensor axes, `motion` (K, 9), and `values` by name: each
-    triad's (λ', b') (6,), `dip` (1,) rad, `lever_arm` (3,) m, sensor axes."""
-
-    q: Array
-    motion: Array
-    values: Mapping[str, Array]
-
-    def moved(self, knots: Array, theta: Array, layout: Mapping[str, slice]) -> State:
-        """After a step: knots (K, s), parameters (p,)."""
-        values = dict(self.values)
-        for name, own in layout.items():
-            values[name] = values[name] + theta[own]
-        return State(
-            multiply(from_rotation_vector(knots[:, :3]), self.q), self.motion + knots[:, 3:], values
-        )
-
-
-@dataclass(frozen=True)
-class Model:
-    """The record prepared for fitting. `rows` names the vector triads present, three residual rows each; they are
-    compared at samples `at` (m,), each triad's readings there in `triads` (the gyroscope's at every sample)."""
-
-    readings: Readings
-    triads: Mapping[str, Centred]
-    knots: Knots
-    rows: tuple[str, ...]
-    at: np.ndarray
-
-    @classmethod
-    def of(cls, readings: Readings, knots: Knots, *, side: int = 0) -> Model:
-        """`side`: vector readings are averaged over that many neighbours on either side (see `averaging_side`)."""
-        given = {name: getattr(readings, name) for name in TRIADS}
-        triads = {name: Centred.of(x) for name, x in given.items() if x is not None and np.isfinite(x).any()}
-        rows = tuple(name for name in TRIADS[1:] if name in triads)
-        at = np.concatenate(
-            [np.arange(a + side, b - side, 2 * side + 1) for a, b in stretches(readings.segment) if b - a > 2 * side]
-        )
-        triads = {name: x.averaged(at, side) if name in rows else x for name, x in triads.items()}
-        return cls(readings, triads, knots, rows, at)
-
-    def field(self, dip: float) -> tuple[Array, Array]:
-        """Local field (3,), NED, at a dip angle, rad, and its derivative."""
-        north, east, _ = self.readings.field_ned
-        strength, heading = np.linalg.norm(self.readings.field_ned), np.arctan2(east, north)
-        level = np.array([np.cos(heading), np.sin(heading), 0.0])
-        down = np.array([0.0, 0.0, 1.0])
-        return (
-            strength * (np.cos(dip) * level + np.sin(dip) * down),
-            strength * (-np.sin(dip) * level + np.cos(dip) * down),
-        )
 
 
 @dataclass(frozen=True)
@@ -165,7 +42,7 @@ def trajectory(model: Model, state: State) -> Trajectory:
     """Integrate the gyroscope from every knot and spread the jump to the next one evenly over the interval."""
     knots, t = model.knots, model.readings.t
     gyro = state.values["gyroscope"]
-    rate = gyro[:3] * model.triads["gyroscope"].x + gyro[3:]
+    rate = gyro[:3] * corrected(model, state.values, "gyroscope") + gyro[3:]
     since, ends = _since_knots(knots, from_rotation_vector(rotation_steps(t, rate)))
     jump = to_rotation_vector(multiply(state.q[1:], conjugate(multiply(state.q[:-1], ends))))
     jump[~knots.joined] = 0.0
@@ -193,12 +70,13 @@ def _since_knots(knots: Knots, steps: Array) -> tuple[Array, Array]:
 @dataclass(frozen=True)
 class Rows:
     """Residuals of samples `own` and what moves them, in units of x: `residual` (m, r), `by_knot` (m, r, 6) for
-    attitude (3) and acceleration (3), `by_parameter` (m, r, p)."""
+    attitude (3) and acceleration (3), `by_parameter` (m, r, p), `by_rotation` (m, r, 3) about the body's axes."""
 
     own: slice
     residual: Array
     by_knot: Array
     by_parameter: Array
+    by_rotation: Array
 
 
 def lever_arm_geometry(model: Model, state: State, own: slice) -> Array:
@@ -219,12 +97,35 @@ def residuals(model: Model, state: State, path: Trajectory) -> Array:
     for own, _ in chunks(model):
         turn = body_from_inertial(path.q[model.at[own]])
         for i, name in enumerate(model.rows):
-            out[own, 3 * i : 3 * i + 3] = _residual(model, state, own, name, _sensed(model, state, own, turn, name)[0])
+            sensed, _ = _sensed(model, state, path, own, turn, name)
+            out[own, 3 * i : 3 * i + 3] = _residual(model, state, own, name, sensed)
     return out
 
 
-def _sensed(model: Model, state: State, own: slice, turn: Array, name: str) -> tuple[Array, Array]:
+def _sensed(
+    model: Model, state: State, path: Trajectory, own: slice, turn: Array, name: str
+) -> tuple[Array, Array]:
     """What a triad should sense, SI, sensor axes (m, 3), and the inertial vector (m, 3) or (3,) behind it."""
+    sensed, vector = _sensed_at_once(model, state, own, turn, name)
+    delay = state.values.get(f"{name}_delay")
+    if delay is not None:
+        turned = from_rotation_vector(-delay * _slow_rate(model, path, own))
+        sensed = np.einsum("nij,nj->ni", body_from_inertial(turned), sensed)
+    return sensed, vector
+
+
+def _slow_rate(model: Model, path: Trajectory, own: slice) -> Array:
+    """Running mean of the rate over 2 RATE_SIDE_S at rows `own`, (m, 3): the gyroscope's noise would be the delay's."""
+    at = model.at[own]
+    side = max(1, round(RATE_SIDE_S / float(np.median(np.diff(model.readings.t)))))
+    first, last = max(int(at[0]) - side, 0), min(int(at[-1]) + side + 1, len(path.rate))
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(path.rate[first:last], axis=0)])
+    low, high = np.maximum(at - side - first, 0), np.minimum(at + side + 1 - first, len(total) - 1)
+    return np.asarray((total[high] - total[low]) / (high - low)[:, None])
+
+
+def _sensed_at_once(model: Model, state: State, own: slice, turn: Array, name: str) -> tuple[Array, Array]:
+    """The same of a triad without a delay of its own."""
     if name == "magnetometer":
         vector = model.field(float(state.values["dip"][0]))[0]
         return turn @ vector, vector
@@ -243,7 +144,8 @@ def _sensed(model: Model, state: State, own: slice, turn: Array, name: str) -> t
 
 def _residual(model: Model, state: State, own: slice, name: str, sensed: Array) -> Array:
     triad, constants = model.triads[name], state.values[name]
-    return np.where(triad.known[own, None], triad.x[own] - (sensed - constants[3:]) / constants[:3], 0.0)
+    x = corrected(model, state.values, name, own)
+    return np.where(triad.known[own, None], x - (sensed - constants[3:]) / constants[:3], 0.0)
 
 
 def chunks(model: Model) -> Iterator[tuple[slice, slice]]:
@@ -263,22 +165,30 @@ def sensitivities(
     """Chunk by chunk: its knots, its rows, and ∂(attitude at the interval's end)/∂θ (knots, 3, p)."""
     for own, ties in chunks(model):
         turn = body_from_inertial(path.q[model.at[own]])
-        moved, ends = _turned_by_gyroscope(model, path, own, ties)
+        moved, ends = _turned_by_gyroscope(model, state, path, own, ties, layout)
+        by_gyroscope = slice(0, moved.shape[2])
         m, r = own.stop - own.start, 3 * len(model.rows)
         residual, by_knot, by_parameter = np.empty((m, r)), np.zeros((m, r, 6)), np.zeros((m, r, parameters))
         for i, name in enumerate(model.rows):
             row = slice(3 * i, 3 * i + 3)
             constants, known = state.values[name], model.triads[name].known[own].astype(float)
-            sensed, vector = _sensed(model, state, own, turn, name)
+            sensed, vector = _sensed(model, state, path, own, turn, name)
             residual[:, row] = _residual(model, state, own, name, sensed)
             gain = known[:, None, None] / constants[:3, None]
             by_knot[:, row, :3] = gain * (turn @ skew(vector))
-            by_parameter[:, row, layout["gyroscope"]] = by_knot[:, row, :3] @ moved
+            by_parameter[:, row, by_gyroscope] = by_knot[:, row, :3] @ moved
             column = layout[name].start
             for axis in range(3):
                 scaled = (sensed[:, axis] - constants[3 + axis]) / constants[axis]
                 by_parameter[:, 3 * i + axis, column + axis] = -known * scaled / constants[axis]
                 by_parameter[:, 3 * i + axis, column + 3 + axis] = -known / constants[axis]
+            if f"{name}_cross" in layout:
+                first = layout[f"{name}_cross"].start
+                for k, (axis, other) in enumerate(CROSS[name]):
+                    by_parameter[:, 3 * i + axis, first + k] = -known * model.triads[name].x[own, other]
+            if f"{name}_delay" in layout:
+                late = np.cross(_slow_rate(model, path, own), sensed)
+                by_parameter[:, row, layout[f"{name}_delay"]] = (gain[..., 0] * late)[..., None]
             if name == "magnetometer" and "dip" in layout:
                 turned = model.field(float(state.values["dip"][0]))[1]
                 by_parameter[:, row, layout["dip"]] = gain * (turn @ turned)[..., None]
@@ -288,28 +198,37 @@ def sensitivities(
                 if "lever_arm" in layout:
                     by_parameter[:, row, layout["lever_arm"]] = -sign * gain * lever_arm_geometry(model, state, own)
         end = np.zeros((ties.stop - ties.start, 3, parameters))
-        end[:, :, layout["gyroscope"]] = ends
-        yield ties, Rows(own, residual, by_knot, by_parameter), end
+        end[:, :, by_gyroscope] = ends
+        yield ties, Rows(own, residual, by_knot, by_parameter, by_knot[..., :3] @ turn.transpose(0, 2, 1)), end
 
 
-def _turned_by_gyroscope(model: Model, path: Trajectory, own: slice, ties: slice) -> tuple[Array, Array]:
-    """∂(attitude error)/∂(λ', b') of the gyroscope at rows (m, 3, 6), the jump's share taken off, and at the ends of
-    the chunk's intervals (knots, 3, 6): ∫ R_nb [diag x, I] dτ from the knot before, trapezoidal."""
+def _turned_by_gyroscope(
+    model: Model, state: State, path: Trajectory, own: slice, ties: slice, layout: Mapping[str, slice]
+) -> tuple[Array, Array]:
+    """∂(attitude error)/∂(λ', b', optional terms) of the gyroscope at rows (m, 3, g), the jump's share taken off, and
+    at the ends of the chunk's intervals (knots, 3, g): ∫ R_nb [diag x, I, …] dτ from the knot before, trapezoidal."""
     knots, t = model.knots, model.readings.t
     first = int(knots.index[ties.start])
     last = int(knots.index[min(ties.stop, len(knots.index) - 1)])  # the last interval ends at the next chunk's knot
     reach = slice(first, last + 1)
-    x = model.triads["gyroscope"].x[reach].T
+    scale = state.values["gyroscope"][:3]
     r_nb = body_from_inertial(path.q[reach]).transpose(2, 1, 0)
-    integrand = np.empty((3, 6, x.shape[1]))  # samples last: long runs for the sums
-    np.multiply(r_nb, x, out=integrand[:, :3])
-    integrand[:, 3:] = r_nb
+    optional = [name for name in layout if name.startswith("gyroscope_")]
+    integrand = np.empty((3, 6 + sum(TERMS[name] for name in optional), r_nb.shape[2]))  # samples last: long runs
+    np.multiply(r_nb, corrected(model, state.values, "gyroscope", reach).T, out=integrand[:, :3])
+    integrand[:, 3:6] = r_nb
+    if "gyroscope_cross" in layout:
+        at, x = layout["gyroscope_cross"].start, model.triads["gyroscope"].x[reach].T
+        for k, (axis, other) in enumerate(CROSS["gyroscope"]):
+            integrand[:, at + k] = r_nb[:, axis] * (scale[axis] * x[other])
+    if "gyroscope_temperature" in layout and model.readings.warmth is not None:
+        integrand[:, layout["gyroscope_temperature"]] = r_nb * (scale[:, None] * model.readings.warmth[reach])
     area = integrand[..., 1:] + integrand[..., :-1]
     area *= 0.5 * np.diff(t[reach])
     total = np.zeros_like(integrand)
     np.cumsum(area, axis=2, out=total[..., 1:])
     at_knots = total[..., knots.index[ties] - first]
-    following = np.r_[knots.index[ties][1:] - first, x.shape[1] - 1]
+    following = np.r_[knots.index[ties][1:] - first, r_nb.shape[2] - 1]
     ends = total[..., following] - at_knots
     ends[..., ~np.r_[knots.joined, False][ties]] = 0.0
     at = model.at[own]
@@ -323,11 +242,13 @@ def accumulate(
 ) -> None:
     """Add a chunk's rows, whitened by `weight` (m, r) = 1/σ² with robust weights in, to the normal equations.
 
-    `groups` ((K, 6, r), (p, r)) collect each row's own reaction to the probe."""
+    `groups` ((K, 6, 2r + 3), (p + 1, 2r + 3)) collect what reacts to the probes, at knots and parameters: each row to
+    its own sign (r), and to gyroscope noise within an interval the rows together, by body axis (3), and each row (r);
+    the last line is a reaction's product with all that react to the same noise."""
     p, (m, r) = len(normal.parameters), weight.shape
     root = np.sqrt(weight)
     share = model.knots.share[model.at[rows.own], None, None]
-    met = np.empty((m + 1, r, 12 + p + 1))
+    met = np.empty((m + 1, r, 12 + p + 4))
     met[m] = 0.0  # one row of nothing, to fill shorter intervals with
     before, after, given = met[:m, :, :6], met[:m, :, 6:12], met[:m, :, 12:]
     np.multiply(rows.by_knot, root[..., None], out=before)
@@ -335,26 +256,34 @@ def accumulate(
     np.subtract(before, after, out=before)
     np.multiply(rows.by_parameter, root[..., None], out=given[..., :p])
     np.multiply(rows.residual, root, out=given[..., p])
-    by_interval = np.take(met, _padded(model, rows.own, ties), axis=0).reshape(ties.stop - ties.start, -1, 13 + p)
-    product = by_interval[..., :12].transpose(0, 2, 1) @ by_interval  # (knots, 12, 13 + p)
-    flat = given.reshape(-1, p + 1)
+    np.multiply(rows.by_rotation * root[..., None], probe.bridge[rows.own, None], out=given[..., p + 1 :])
+    by_interval = np.take(met, _padded(model, rows.own, ties), axis=0).reshape(ties.stop - ties.start, -1, 16 + p)
+    product = by_interval[..., :12].transpose(0, 2, 1) @ by_interval  # (knots, 12, 16 + p)
+    flat = given.reshape(-1, p + 4)
     total = flat.T @ flat
+    bridge = given[..., p + 1 :].sum(axis=2)
+    signs = probe.sensors[rows.own] * (root > 0)
+    alone = np.stack([signs, bridge], axis=2)[:, :, None, :]
     normal.parameters += total[:p, :p]
     normal.parameters_right[:, GRADIENT] += total[:p, p]
-    reaction = met[:m] * (probe.sensors[rows.own] * (root > 0))[..., None]
-    own = reaction[..., 12:-1].sum(axis=0).T
+    own = (flat[:, :p].reshape(m, r, p) * signs[..., None]).sum(axis=0).T
     normal.parameters_right[:, SENSORS] += own.sum(axis=1)
-    groups[1][:] += own
-    pulled = sums_by_interval(model, reaction[..., :12].reshape(m, -1), rows.own, ties).reshape(-1, r, 12)
-    pulled = pulled.transpose(0, 2, 1)
+    normal.parameters_right[:, BRIDGE] += total[:p, p + 1 :].sum(axis=1)
+    groups[1][:p, :r] += own
+    groups[1][p, r:] += np.r_[total[p + 1 :, p + 1 :].sum(axis=1), np.sum(bridge**2, axis=0)]
+    pulled = sums_by_interval(model, (met[:m, :, :12, None] * alone).reshape(m, -1), rows.own, ties)
+    pulled = pulled.reshape(-1, r, 12, 2).transpose(0, 2, 1, 3)
+    pulled = np.concatenate([pulled[..., 0], product[:, :, 13 + p :], pulled[..., 1]], axis=2)
     # Chain blocks: an interval's rows pull at the knot before it and, where the record goes on, at the one after.
     last = min(ties.stop, len(normal.diagonal) - 1)
     inside, following = slice(0, last - ties.start), slice(ties.start + 1, last + 1)
     for knot, part, here in ((ties, slice(0, 6), slice(None)), (following, slice(6, 12), inside)):
         groups[0][knot] += pulled[here, part]
-        right = np.concatenate([product[here, part, 12:], pulled[here, part].sum(axis=2, keepdims=True)], axis=2)
+        probes = np.stack([pulled[here, part, :r].sum(axis=2), pulled[here, part, r : r + 3].sum(axis=2)], axis=2)
         for state, own_part in BLOCKS:
-            normal.right[knot, state, : p + 2] += right[:, own_part]
+            normal.right[knot, state, : p + 1] += product[here, part, 12 : 13 + p][:, own_part]
+            normal.right[knot, state, p + SENSORS] += probes[:, own_part, 0]
+            normal.right[knot, state, p + BRIDGE] += probes[:, own_part, 1]
             for other, other_part in BLOCKS:
                 columns = slice(part.start + other_part.start, part.start + other_part.stop)
                 normal.diagonal[knot, state, other] += product[here, part, columns][:, own_part]
@@ -386,12 +315,14 @@ def layout_of(
 ) -> tuple[dict[str, slice], int]:
     """Where each free parameter stands in θ, and how many there are: optional terms where `values` has them."""
     layout, at = {}, 0
-    free = ["gyroscope", *model.rows]
+    optional = [name for name in OPTIONAL if name in values]
+    by_gyroscope = [name for name in optional if name.startswith("gyroscope_")]  # one block, from the start
+    free = ["gyroscope", *by_gyroscope, *model.rows]
     if dip and len(model.rows) == 2:
         free.append("dip")
     if lever_arm and "accelerometer" in model.rows:
         free.append("lever_arm")
-    free += [name for name in OPTIONAL if name in values]
+    free += [name for name in optional if name not in free]
     for name in free:
         size = {"dip": 1, "lever_arm": 3, **OPTIONAL}.get(name, 6)
         layout[name] = slice(at, at + size)

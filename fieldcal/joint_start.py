@@ -12,7 +12,7 @@ from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.gyro_equation import fit_equation_error
 from fieldcal.gyro_output import propagate_stretches
 from fieldcal.joint_chain import STATES, place_knots
-from fieldcal.joint_model import Model, Readings, State, averaging_side, stretches
+from fieldcal.joint_record import Model, Readings, State, averaging_side, stretches
 from fieldcal.rotation import Array, angle_between, body_from_inertial, continuous, from_rotation_vector, multiply
 from fieldcal.smoothing import differentiate_samples, smooth_samples
 

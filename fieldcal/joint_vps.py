@@ -13,19 +13,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fieldcal.joint_chain import GRADIENT, Normal
-from fieldcal.joint_model import OPTIONAL, Model, State, Trajectory
+from fieldcal.joint_model import Trajectory
+from fieldcal.joint_record import OPTIONAL, Model, State
 from fieldcal.rotation import (
     Array,
     body_from_inertial,
     conjugate,
     continuous,
     from_rotation_vector,
+    hermite,
     multiply,
-    slerp,
     to_rotation_vector,
 )
 from fieldcal.statistics import robust_sigma, white_noise_sigma
 from fieldcal.sync import SyncFit, align_frames
+from fieldcal.sync_field import block_rates
 
 PARAMETERS = ("vps_clock", "vps_world", "vps_body")
 LEAST_SIGMA_RAD = 2e-5
@@ -39,11 +41,13 @@ class VpsRecord:
     """VPS poses for the joint estimate.
 
     `t` (m,) s, VPS clock; `q` (m, 4) attitude, inertial NED, of the sensor axes but for constant rotations near none;
+    `rate` (m, 3) its body rate, rad/s, to interpolate with;
     `max_gap_s` longest gap interpolated over; `clock` where its clock starts; `world`, `body` (4,) the constant
     rotations there; `used` (K,) knots whose pose is used; `sigma_rad` its noise, an axis."""
 
     t: Array
     q: Array
+    rate: Array
     max_gap_s: float
     clock: SyncFit
     world: Array
@@ -61,7 +65,8 @@ class VpsRecord:
         turned = to_rotation_vector(multiply(q[1:], conjugate(q[:-1])))
         noise = float(np.max(white_noise_sigma(np.cumsum(turned, axis=0))))
         none = np.array([0.0, 0.0, 0.0, 1.0])
-        record = cls(t, q, max_gap_s, clock, none, none, np.ones(len(model.knots.index), dtype=bool), noise)
+        every = np.ones(len(model.knots.index), dtype=bool)
+        record = cls(t, q, block_rates(t, q, max_gap_s), max_gap_s, clock, none, none, every, noise)
         at_knots, known = record._read(model, np.zeros(2))
         if known.sum() < MIN_POSES:
             return None
@@ -87,6 +92,10 @@ class VpsRecord:
         bad[1:-1] = suspect & (score[1:-1] >= score[:-2]) & (score[1:-1] >= score[2:])
         return bad
 
+    def at_knots(self, model: Model, state: State, path: Trajectory) -> VpsRecord | None:
+        """The same record for the knots of another model: its start's clock and mounting are this one's."""
+        return VpsRecord.of(self.t, self.q, self.clock, model, state, path, max_gap_s=self.max_gap_s)
+
     def start(self) -> dict[str, Array]:
         """Values of a start: corrections to `clock`, `world` and `body`."""
         return {name: np.zeros(OPTIONAL[name]) for name in PARAMETERS}
@@ -107,7 +116,7 @@ class VpsRecord:
         at = (model.readings.t[model.knots.index] - middle) * (1 + skew) + middle - lag
         i = np.clip(np.searchsorted(self.t, at, side="right") - 1, 0, len(self.t) - 2)
         known = (at >= self.t[0]) & (at <= self.t[-1]) & (self.t[i + 1] - self.t[i] <= self.max_gap_s)
-        return slerp(self.t, self.q, at), known
+        return hermite(self.t, self.q, self.rate, at), known
 
     def residual(self, model: Model, state: State) -> tuple[Array, np.ndarray]:
         """(K, 3) rad, inertial axes, VPS less estimate; and which knots count."""

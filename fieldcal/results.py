@@ -66,11 +66,13 @@ def triad_rows(
     temperature_degc: float | None,
     status: tuple[str, str, str] = ("ok", "ok", "ok"),
     reason_code: tuple[str | None, str | None, str | None] = (None, None, None),
+    cross_sd: Array | None = None,
 ) -> list[dict[str, Any]]:
     """Rows scale, bias, zero and zero_bias of one triad with their standard deviations.
 
     `scale` (3, 3), `bias` (3,), `covariance` (6, 6) of (λx, λy, λz, bx, by, bz). zero = −b/λ in logged units;
-    zero_bias = λ d0 + b at `reference_reading` d0 (3,). Off-diagonal scales (full form) carry no sd.
+    zero_bias = λ d0 + b at `reference_reading` d0 (3,). Off-diagonal scales (full form) have the sd
+    of `cross_sd` (3, 3), if any.
     """
     matrix, b, d0 = (np.asarray(v, dtype=float) for v in (scale, bias, reference_reading))
     divisor = f"({logged_unit})" if "/" in logged_unit else logged_unit
@@ -109,5 +111,7 @@ def triad_rows(
     if full:
         for i, row in enumerate(AXES):
             for j, column in enumerate(AXES):
-                add("scale", row + column, i, matrix[i, j], covariance[i, i] if i == j else None, scale_unit)
+                own_variance = None if cross_sd is None else float(cross_sd[i, j] ** 2)
+                variance = covariance[i, i] if i == j else own_variance
+                add("scale", row + column, i, matrix[i, j], variance, scale_unit)
     return rows

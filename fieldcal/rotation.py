@@ -183,6 +183,22 @@ def propagate(t: ArrayLike, rate: ArrayLike, initial: ArrayLike) -> Array:
     return q
 
 
+def hermite(t: ArrayLike, q: ArrayLike, rate: ArrayLike, at: ArrayLike) -> Array:
+    """Cubic interpolation of attitudes (n, 4) with body rates (n, 3), rad/s, at times `at` (m,).
+
+    Between samples T apart SLERP cuts a swing of ω rad/s short by (ωT)²/12: 0.3 % at 3 Hz and 10 ms. Samples without a
+    rate (NaN) fall back on it."""
+    t, q, rate, at = (np.asarray(x, dtype=float) for x in (t, q, rate, at))
+    i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    step = t[i + 1] - t[i]
+    u = np.clip((at - t[i]) / step, 0.0, 1.0)[:, None]
+    whole = to_rotation_vector(multiply(conjugate(q[i]), q[i + 1]))
+    begin, end = rate[i] * step[:, None], rate[i + 1] * step[:, None]
+    begin, end = (np.where(np.isfinite(x), x, whole) for x in (begin, end))
+    turned = (3 - 2 * u) * u**2 * whole + u * (1 - u) ** 2 * begin - u**2 * (1 - u) * end
+    return multiply(q[i], from_rotation_vector(turned))
+
+
 def slerp(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:
     """Spherical interpolation of attitudes q (n, 4) at rising stamps t (n,) to the times `at` (m,).
 

@@ -56,6 +56,7 @@ class Experiment:
     peak_rad: tuple[float, float] = (0.7, 1.1)
     doublet_s: tuple[float, float] = (2.2, 3.0)
     cross_coupling: float = 0.12
+    turned: tuple[float, float, float] = (1.0, 1.0, 1.0)  # share of bank, pitch and heading that is flown
     tremor_rad: float = 0.01
     gravity_mps2: float = 9.81
     dip_rad: float = 0.0
@@ -124,7 +125,7 @@ class Motion:
                 mix[axis] = 1.0
                 starts.append(clock)
                 lengths.append(length)
-                amplitudes.append(peak * mix)
+                amplitudes.append(peak * mix * e.turned)
                 clock += length + rng.uniform(0.2, 0.6)
             clock += rng.uniform(0.5, 1.5)
         # Centred in the record; a longer record repeats nothing, a shorter one is scaled to fit.

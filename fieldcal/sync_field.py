@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldcal.manoeuvre import contiguous
-from fieldcal.rotation import Array, body_from_inertial, body_rate, continuous, skew, slerp
+from fieldcal.rotation import Array, body_from_inertial, body_rate, continuous, hermite, skew
 from fieldcal.smoothing import differentiate_samples
 from fieldcal.statistics import huber_inflation, huber_weights, least_squares_covariance, robust_sigma
 from fieldcal.sync import SyncFit
@@ -75,10 +75,8 @@ def _clock(
     """Gauss–Newton on lag and skew, the linear coefficients eliminated at every step."""
     known = np.isfinite(logged).all(axis=1)
     t, logged = t[known], logged[known]
-    q, rate = continuous(q_vps), np.full((len(t_vps), 3), np.nan)
-    for a, b in contiguous(t_vps, max_gap_s):
-        if b - a >= SHORTEST_BLOCK:
-            rate[a:b] = body_rate(q[a:b], differentiate_samples(t_vps[a:b], q[a:b], window_s=RATE_WINDOW_S))
+    q = continuous(q_vps)
+    rate = block_rates(t_vps, q, max_gap_s)
     lag, skewed = fit.lag_mid_s, 1e-6 * fit.skew_ppm
     for _ in range(MAX_ITERATIONS):
         at = (t - fit.reference_s) * (1 + skewed) + fit.reference_s - lag
@@ -88,7 +86,7 @@ def _clock(
         inside &= np.isfinite(turning).all(axis=1)
         if inside.sum() < MIN_READINGS:
             return None
-        attitude = body_from_inertial(slerp(t_vps, q, at[inside]))
+        attitude = body_from_inertial(hermite(t_vps, q, rate, at[inside]))
         x = np.column_stack([attitude.reshape(-1, 9), np.ones(len(attitude))])
         weight, coefficients, residual = _regressed(x, logged[inside])
         # Ȧ = −S(ω)A; a later lag reads the VPS earlier.
@@ -108,6 +106,15 @@ def _clock(
     difference = np.array([lag - fit.lag_mid_s, skewed - 1e-6 * fit.skew_ppm])
     disagreement = float(difference @ np.linalg.solve(covariance + fit.covariance, difference))
     return FieldClock(lag, skewed, covariance, disagreement)
+
+
+def block_rates(t: Array, q: Array, max_gap_s: float) -> Array:
+    """Body rates (m, 3), rad/s, of VPS attitudes (m, 4), hemisphere continuous; NaN in blocks too short."""
+    rate = np.full((len(t), 3), np.nan)
+    for a, b in contiguous(t, max_gap_s):
+        if b - a >= SHORTEST_BLOCK:
+            rate[a:b] = body_rate(q[a:b], differentiate_samples(t[a:b], q[a:b], window_s=RATE_WINDOW_S))
+    return rate
 
 
 def _regressed(x: Array, y: Array) -> tuple[Array, Array, Array]:

@@ -30,6 +30,8 @@ def print_flight(console: Console, document: Mapping[str, Any]) -> None:
     if document["calibration"]:
         console.print(parameter_table(document["calibration"]))
     print_refusals(console, document["run"])
+    for sentence in advised(document["run"]):
+        console.print(sentence, markup=False)
     if document["fit"]:
         console.print(fit_table(document["fit"]))
     if document["sync"] is not None:
@@ -89,6 +91,11 @@ def print_refusals(console: Console, runs: Rows) -> None:
         console.print(f"not run for want of their input: {', '.join(follow)}", markup=False)
 
 
+def advised(runs: Rows) -> list[str]:
+    """What would make weak constants better, by the stages that found them (a refused stage says it in its reason)."""
+    return [run["measured"]["advice"] for run in runs if run["status"] == "ok" and run["measured"].get("advice")]
+
+
 def is_consequence(run: Mapping[str, Any]) -> bool:
     """Whether a stage stopped only because another stage gave it nothing: `no_` and one of the tables that it needs.
 
@@ -103,13 +110,14 @@ def is_consequence(run: Mapping[str, Any]) -> bool:
 
 def fit_table(rows: Rows) -> Any:
     """The Theil inequality coefficients, raw and smoothed side by side, with degrees and rad/s."""
-    by_place = {(r["quantity"], r["method"], r["reference"], r["signal"]): r for r in rows}
+    by_place = {(r["quantity"], r["method"], r["reference"], r["sample"], r["signal"]): r for r in rows}
     order = {name: i for i, name in enumerate(QUANTITIES)}
-    keys = sorted(dict.fromkeys(key[:3] for key in by_place), key=lambda key: (order.get(key[0], 9), key))
+    keys = sorted(dict.fromkeys(key[:4] for key in by_place), key=lambda key: (order.get(key[0], 9), key))
     lines = []
     for key in keys:
         raw, smoothed = (by_place.get((*key, signal)) for signal in ("raw", "smoothed"))
-        lines.append([QUANTITIES.get(key[0], key[0]), key[1], key[2], *_fit(raw), *_fit(smoothed)])
+        quantity = str(QUANTITIES.get(key[0], key[0])) + ("" if key[3] == "all" else ", held out")
+        lines.append([quantity, key[1], key[2], *_fit(raw), *_fit(smoothed)])
     return table(["quantity", "method", "against", "TIC raw", "rms raw", "TIC smoothed", "rms smoothed"], lines)
 
 

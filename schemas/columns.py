@@ -202,7 +202,8 @@ PARAMETER = Column(
     "parameter",
     _TEXT,
     "",
-    "scale, bias: z = scale * logged + bias, sensor axes; zero = -bias/scale; zero_bias: z at the reference reading",
+    "scale, bias: z = scale * logged + bias, sensor axes; zero = -bias/scale; zero_bias: z at the reference reading; "
+    "zero_per_degc: slope of the zero",
 )
 AXIS = Column("axis", _TEXT, "", "sensor axis x, y or z; full form xx, xy, ...")
 VALUE = Column("value", _F64, "named by column unit", "estimate of the parameter; null when refused without a number")
@@ -216,7 +217,7 @@ RUN_KEY = Column(
 QUANTITY = Column(
     "quantity", _TEXT, "", "what is compared: attitude, quaternion_rate, attitude_propagated or body_rate"
 )
-REFERENCE = Column("reference", _TEXT, "", "what it is compared with: vps or quest")
+REFERENCE = Column("reference", _TEXT, "", "what it is compared with: vps, quest or joint")
 SIGNAL = Column("signal", _TEXT, "", "readings that were compared: raw or smoothed")
 SAMPLE = Column("sample", _TEXT, "", "samples that were compared: all, or held_out of the estimation")
 TIC = Column("tic", _F64, "1", "Theil inequality coefficient: 0 perfect, 1 no likeness")

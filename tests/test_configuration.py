@@ -199,6 +199,8 @@ def test_settings_are_plain_json_and_leave_names_out() -> None:
         ("[vehicles.a.parameters]\nsmothing_cutoff_hz = 1", "unknown_key", 'did you mean "smoothing_cutoff_hz"'),
         ("[vehicles.a.csv.imu]\ngyro = ['x','y','z']", "unknown_key", 'did you mean "gyroscope"'),
         ("[vehicles.a]\nunits = { compass = 'T' }", "unknown_key", "did you mean"),
+        ("[vehicles.a.method]\ngyroscope = 'magic'", "wrong_value", '"magic" is not one of serial, joint'),
+        ("[vehicles.a.method]\ngyro = 'joint'", "unknown_key", 'did you mean "gyroscope"?'),
         ("[vehicles.a]\nmethod = 'magic'", "wrong_value", '"magic" is not one of serial, joint'),
         ("[vehicles.a]\nworld = 'NED'", "wrong_value", "not one of ned, enu"),
         ("[vehicles.a]\nimu_id = 7", "wrong_type", "a text is needed here, not 7"),
@@ -256,3 +258,20 @@ def test_unreadable_files(tmp_path: Path) -> None:
     marked = tmp_path / "marked.toml"
     marked.write_bytes(b"\xef\xbb\xbf[vehicles.a]\nimu_id = 'x'")
     assert load(marked).vehicle("a").imu_id == "x"
+
+
+def test_method_is_one_name_or_one_a_sensor() -> None:
+    loaded = parse(
+        """
+        [defaults]
+        method = "joint"
+        [vehicles.a.method]
+        magnetometer = "serial"
+        [vehicles.b]
+        method = "serial"
+        """,
+        None,
+    )
+    assert loaded.vehicle("c").method == "joint"
+    assert loaded.vehicle("a").method == {"magnetometer": "serial", "accelerometer": "joint", "gyroscope": "joint"}
+    assert loaded.vehicle("b").method == "serial"

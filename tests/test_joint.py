@@ -10,7 +10,7 @@ import pytest
 from fieldcal import joint_start
 from fieldcal.errors import UnusableFlight
 from fieldcal.joint import JointFit, fit_joint
-from fieldcal.joint_model import TRIADS, Readings
+from fieldcal.joint_record import TRIADS, Readings
 from fieldcal.rotation import angle_between
 from fieldcal.simulate import Experiment, Recording, constants_at, simulate
 from tests.numerics_support import rms

@@ -1,4 +1,5 @@
-"""What a flight's refusals are told as: each cause once, what only follows from one in a line."""
+"""What a flight's refusals are told as: each cause once, what only follows from one in a line; held-out comparisons and
+advice beside."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from fieldcal.pipeline import PIPELINE, run_stage
-from flows.present_flight import is_consequence, print_refusals
+from flows.present_flight import advised, fit_table, is_consequence, print_refusals
 
 
 def run(stage: str, code: str, status: str = "refused") -> dict[str, Any]:
@@ -50,3 +51,23 @@ def test_causes_are_told_and_consequences_listed() -> None:
     assert lines[0].startswith("refused gyro_equation_pass2 (no_gyroscope)")
     assert lines[-1] == "not run for want of their input: gyro_output, joint"
     assert "gyro_output says" not in text.getvalue()
+
+
+def fit_row(sample: str, tic: float) -> dict[str, Any]:
+    place = {"quantity": "body_rate", "method": "joint", "reference": "vps", "signal": "raw", "sample": sample}
+    return place | {"tic": tic, "rms": 0.2, "rms_unit": "rad/s"}
+
+
+def test_held_out_comparisons_stand_beside_all() -> None:
+    text = io.StringIO()
+    Console(file=text, width=160).print(fit_table([fit_row("all", 0.0781), fit_row("held_out", 0.0913)]))
+    assert "0.0781" in text.getvalue()
+    assert "0.0913" in text.getvalue()
+    assert "body rate, held out" in text.getvalue()
+
+
+def test_advice_is_given_where_a_stage_went_well_but_weakly() -> None:
+    weak = {"stage": "joint", "status": "ok", "measured": {"advice": "Add 60° of roll."}}
+    strong = {"stage": "joint", "status": "ok", "measured": {"advice": ""}}
+    refused = {"stage": "joint", "status": "refused", "measured": {"advice": "Add 60° of yaw."}}
+    assert advised([weak, strong, refused, {"stage": "verify", "status": "ok", "measured": {}}]) == ["Add 60° of roll."]

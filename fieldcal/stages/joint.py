@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal import joint_start, sensor
+from fieldcal import joint_start, joint_terms, sensor
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.frames import (
     AXES,
@@ -23,9 +23,9 @@ from fieldcal.frames import (
 )
 from fieldcal.joint import JointFit, fit_joint
 from fieldcal.joint_covariance import advice
-from fieldcal.joint_model import Readings
+from fieldcal.joint_record import TERMS, Readings
 from fieldcal.results import StageResult, fatal_fault, triad_rows
-from fieldcal.rotation import Array, from_matrix, multiply
+from fieldcal.rotation import Array, body_from_inertial, from_matrix, multiply
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Settings, Tables, mean_temperature, reference_reading, refusal
 from fieldcal.stages.joint_reference import Poses, poses_of, with_poses
@@ -46,7 +46,7 @@ MAX_GYRO_NOISE_SHARE = 0.5
 
 def estimate_jointly(tables: Tables, s: Settings) -> StageResult:
     """samples, serial constants → calibration, attitude, covariance, fit: everything in one likelihood."""
-    if s["method"] != METHOD:
+    if not chosen(s):
         return StageResult(status="absent", reason_code="not_selected", reason='The method is "serial".')
     if "samples" not in tables:
         return StageResult(status="refused", reason_code="no_samples", reason="No segment of the log is usable.")
@@ -65,40 +65,43 @@ def estimate_jointly(tables: Tables, s: Settings) -> StageResult:
         return refusal(error, "joint estimate")
     poses = poses_of(tables, s)
     fit, by_vps = with_poses(fit, poses, s)
+    fit, tests = joint_terms.add_terms(fit)
     result = _written(fit, tables, s, axes)
     return replace(
         result,
         tables={**result.tables, **_held_out(fit, readings, tables, s, arm, poses)},
-        measured={**result.measured, **by_vps},
+        measured={**result.measured, **by_vps, "terms": joint_terms.told(tests, fit)},
     )
+
+
+def chosen(s: Settings) -> tuple[str, ...]:
+    """Sensors whose constants this method is to give: `method` names one for all, or one for each."""
+    method = s["method"]
+    return tuple(name for name in SENSORS if (method if isinstance(method, str) else method[name]) == METHOD)
 
 
 def _held_out(
     fit: JointFit, readings: Readings, tables: Tables, s: Settings, arm: Array | None, poses: Poses | None
 ) -> dict[str, pl.DataFrame]:
     """Gyroscope constants from the first part of the flight alone, with `from_ns`, where the rest begins: `verify`
-    predicts that. None where the part determines nothing."""
+    predicts that. None where the part determines nothing, or another method gives the gyroscope's."""
+    if "gyroscope" not in chosen(s):
+        return {}
     split = int(HELD_IN_SHARE * len(readings.t))
-    part = replace(
-        readings,
-        t=readings.t[:split],
-        segment=readings.segment[:split],
-        turning=readings.turning[:, :split],
-        gyroscope=readings.gyroscope[:split],
-        accelerometer=None if readings.accelerometer is None else readings.accelerometer[:split],
-        magnetometer=None if readings.magnetometer is None else readings.magnetometer[:split],
-    )
+    part = readings.part(slice(0, split))
     known = {name: fit.constants(name)[:2] for name in SENSORS if name in fit.layout}
     try:
         own = fit_joint(*joint_start.prepare(part, known, lever_arm=arm), try_lever_arm=arm is None)
         own, _ = with_poses(own, poses, s)
+        kept = [name for name in TERMS if name in fit.layout]
+        own = joint_terms.with_terms(own, kept) if kept else own
     except (UnusableFlight, EstimationError):
         return {}
-    scale, bias, covariance = own.constants("gyroscope")
+    matrix, bias, covariance, _ = _triad(own, "gyroscope")
     rows = triad_rows(
         "gyroscope",
         METHOD,
-        np.diag(scale),
+        matrix,
         bias,
         covariance,
         unit="rad/s",
@@ -128,6 +131,7 @@ def readings_of(tables: Tables, s: Settings) -> Readings:
     sound = {name: all(fatal_fault(faults, (name,)) is None for faults in told) for name in SENSORS}
     given = {n: x if sound[n] and np.isfinite(x).any() else None for n, x in logged.items() if n != "gyroscope"}
     return Readings(
+        warmth=_warmth(tables, t),
         t=t,
         segment=segment,
         gyroscope=logged["gyroscope"],
@@ -136,6 +140,16 @@ def readings_of(tables: Tables, s: Settings) -> Readings:
         turning=joint_start.turning(t, segment, logged["gyroscope"]),
         **given,
     )
+
+
+def _warmth(tables: Tables, t: Array) -> Array | None:
+    """Temperature at the samples less its mean, °C (n,); None without one."""
+    table = tables.get("temperature")
+    if table is None or (table := table.drop_nulls()).is_empty():
+        return None
+    at = seconds(table["t_ns"], tables["samples"]["t_ns"][0])
+    warm = np.interp(t, at, table["temperature_degc"].to_numpy())
+    return np.asarray(warm - warm.mean())
 
 
 def start_constants(tables: Tables, s: Settings, readings: Readings) -> dict[str, tuple[Array, Array] | None]:
@@ -160,15 +174,15 @@ def _written(fit: JointFit, tables: Tables, s: Settings, axes: Array) -> StageRe
     """Rows with a status by sensor and axis, the attitude, the covariance, and the numbers that decided."""
     rows: list[dict[str, Any]] = []
     codes: dict[str, list[str | None]] = {}
-    for name in SENSORS:
+    for name in chosen(s):
         if name not in fit.layout:
             continue
-        scale, bias, covariance = fit.constants(name)
-        codes[name] = _judged(name, fit, scale, covariance, s)
+        full, bias, covariance, cross_sd = _triad(fit, name)
+        codes[name] = _judged(name, fit, np.diagonal(full), covariance, s)
         rows += triad_rows(
             name,
             METHOD,
-            np.diag(scale),
+            full,
             bias,
             covariance,
             unit=UNITS[name] or s["field_unit"],
@@ -177,16 +191,58 @@ def _written(fit: JointFit, tables: Tables, s: Settings, axes: Array) -> StageRe
             temperature_degc=mean_temperature(tables),
             status=tuple("refused" if code else "ok" for code in codes[name]),  # type: ignore[arg-type]
             reason_code=tuple(codes[name]),  # type: ignore[arg-type]
+            cross_sd=cross_sd,
         )
+    if "gyroscope" in codes:
+        rows += _slope_rows(fit, tables, s, codes["gyroscope"])
     bad = [f"{name} {axis}: {c}" for name, own in codes.items() for axis, c in zip(AXES, own, strict=True) if c]
     every = len(bad) == 3 * len(codes)
     measured = _measured(fit, axes)
     first = next((code for own in codes.values() for code in own if code), None)
     reason = f"Refused by the joint estimate ({', '.join(bad)}). {measured['advice']}".strip() if bad else None
+    if not codes:
+        first, reason = f"no_{chosen(s)[0]}", "None of the sensors that method joint is chosen for has readings."
     result = {"calibration": calibration_rows(rows), "covariance": covariance_table(fit.covariance)}
-    if not any(codes["gyroscope"]):
+    full, _, covariance, _ = _triad(fit, "gyroscope")
+    if not any(_judged("gyroscope", fit, np.diagonal(full), covariance, s)):
         result["attitude"] = _attitude_table(fit, tables, axes)
     return StageResult(result, "refused" if every else "ok", first, reason, measured)
+
+
+def _triad(fit: JointFit, name: str) -> tuple[Array, Array, Array, Array | None]:
+    """Λ (3, 3), b (3,), covariance (6, 6) of its diagonal and b, and the sd (3, 3) of Λ where it has cross-axis
+    terms."""
+    if f"{name}_cross" not in fit.layout:
+        scale, bias, covariance = fit.constants(name)
+        return np.diag(scale), bias, covariance, None
+    full, bias, covariance = fit.full_constants(name)
+    own = np.ix_([0, 4, 8, 9, 10, 11], [0, 4, 8, 9, 10, 11])
+    return full, bias, covariance[own], np.sqrt(np.diagonal(covariance)[:9]).reshape(3, 3)
+
+
+def _slope_rows(fit: JointFit, tables: Tables, s: Settings, codes: list[str | None]) -> list[dict[str, Any]]:
+    """The gyroscope's zero against temperature, where the flight shows it."""
+    if "gyroscope_temperature" not in fit.layout:
+        return []
+    spread = fit.model.triads["gyroscope"].spread
+    value = -fit.state.values["gyroscope_temperature"] * spread
+    sd = np.sqrt(np.diagonal(fit.covariance)[fit.layout["gyroscope_temperature"]]) * spread
+    unit = s["units"]["gyroscope"]
+    return [
+        {
+            "sensor": "gyroscope",
+            "method": METHOD,
+            "parameter": "zero_per_degc",
+            "axis": axis,
+            "value": float(value[i]),
+            "sd": float(sd[i]),
+            "unit": f"({unit})/degC" if "/" in unit else f"{unit}/degC",
+            "temperature_degc": mean_temperature(tables),
+            "status": "refused" if codes[i] else "ok",
+            "reason_code": codes[i],
+        }
+        for i, axis in enumerate(AXES)
+    ]
 
 
 def _judged(name: str, fit: JointFit, scale: Array, covariance: Array, s: Settings) -> list[str | None]:
@@ -202,11 +258,14 @@ def _judged(name: str, fit: JointFit, scale: Array, covariance: Array, s: Settin
     relative = np.sqrt(np.diagonal(covariance)[:3]) / np.abs(scale)
     polarity = np.asarray(s["polarity"][name], dtype=float)
     nominal = s["nominal_scale"][name]
+    noisy = axis_noise_share(fit) > MAX_GYRO_NOISE_SHARE if name == "gyroscope" else np.zeros(3, dtype=bool)
     out: list[str | None] = []
     for i in range(3):
         ratio = 1.0 if nominal is None else abs(scale[i] / nominal[i])
         if not relative[i] <= limit:
             out.append("scale_uncertain")
+        elif noisy[i]:
+            out.append("axis_not_turned")
         elif np.sign(scale[i]) != polarity[i]:
             out.append("polarity_contradiction")
         else:
@@ -219,6 +278,18 @@ def gyro_noise_share(fit: JointFit) -> float:
     turned = np.sqrt(np.mean(np.sum(fit.path.rate**2, axis=1))) * fit.model.knots.interval_s
     jumped = np.linalg.norm(fit.path.jump, axis=1)
     return float(np.sqrt(np.mean(jumped**2) / np.mean(turned**2)))
+
+
+def axis_noise_share(fit: JointFit) -> Array:
+    """The same of each gyroscope axis (3,). Of an axis about which the vehicle hardly turned noise is all there is, and
+    a regressor that is noise says nothing of its scale, however small its sd."""
+    knots, q = fit.model.knots, fit.state.q[:-1]
+    jump = np.einsum("kij,kj->ki", body_from_inertial(q), fit.path.jump)[knots.joined]
+    samples = np.diff(knots.index)
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(fit.path.rate, axis=0)])
+    mean = (total[knots.index[1:]] - total[knots.index[:-1]]) / samples[:, None]
+    turned = (mean * knots.interval_s[:, None])[knots.joined]
+    return np.asarray(np.sqrt(np.mean(jump**2, axis=0) / np.mean(turned**2, axis=0)))
 
 
 def misfit(fit: JointFit, name: str) -> float:
@@ -247,8 +318,9 @@ def _measured(fit: JointFit, axes: Array) -> dict[str, Any]:
         "misfit": {name: misfit(fit, name) for name in fit.model.rows},
         "gyro_walk_deg_per_sqrt_s": float(np.degrees(np.sqrt(fit.levels.walk))),
         "gyro_noise_share": gyro_noise_share(fit),
+        "axis_noise_share": [float(v) for v in axis_noise_share(fit)],
         "translation_rms_mps2": float(np.sqrt(3.0) * fit.levels.strength),
-        "advice": advice(fit.model, fit.state, fit.layout, fit.covariance),
+        "advice": advice(fit.model, fit.state, fit.layout, fit.covariance, axes),
     }
     if "dip" in fit.layout:
         own = fit.layout["dip"].start

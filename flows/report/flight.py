@@ -8,7 +8,7 @@ from typing import Any
 import polars as pl
 
 from fieldcal.stages.warm_up import METHOD as WARM_UP
-from flows.present_flight import QUANTITIES, is_consequence, sync_sentence
+from flows.present_flight import QUANTITIES, advised, is_consequence, sync_sentence
 from flows.report import flight_figures as draw
 from flows.report.flight_curves import Curves, curves
 from flows.report.flight_data import FlightData
@@ -97,6 +97,7 @@ def _refusals(data: FlightData) -> list[Part]:
         if row["status"] == "ok" and row["reason_code"] and row["measured"].get("reason") != flight["reason"]:
             noted.setdefault(str(row["measured"].get("reason") or row["reason_code"]), []).append(row["stage"])
     parts += [Text(f"{', '.join(stages)}: {reason}") for reason, stages in noted.items()]
+    parts += [Text(sentence) for sentence in advised(data.run) if not any(sentence in reason for reason in noted)]
     return parts or [Text("Nothing was refused, and the log was read whole.")]
 
 
@@ -157,15 +158,16 @@ def _paper_table(rows: Sequence[Mapping[str, Any]], caption: str, letter: str) -
 def _agreement(data: FlightData) -> list[Part]:
     if not data.fit:
         return [Text("Nothing could be compared."), *_sync(data)]
-    by_place = {(r["quantity"], r["method"], r["reference"], r["signal"]): r for r in data.fit}
+    by_place = {(r["quantity"], r["method"], r["reference"], r["sample"], r["signal"]): r for r in data.fit}
     order = list(QUANTITIES)
-    keys = sorted({key[:3] for key in by_place}, key=lambda key: (order.index(key[0]) if key[0] in order else 9, key))
+    keys = sorted({key[:4] for key in by_place}, key=lambda key: (order.index(key[0]) if key[0] in order else 9, key))
     lines = []
     for key in keys:
         own = [by_place.get((*key, signal)) for signal in ("raw", "smoothed")]
-        printed = PAPER_TIC.get(key)
+        printed = PAPER_TIC.get(key[:3]) if key[3] == "all" else None
         cells = [text for row in own for text in _fit_cells(row)]
-        names = [QUANTITIES.get(key[0], key[0]), plain_name(key[1]), plain_name(key[2])]
+        quantity = QUANTITIES.get(key[0], key[0]) + ("" if key[3] == "all" else ", held out")
+        names = [quantity, plain_name(key[1]), plain_name(key[2])]
         lines.append([*names, "–" if printed is None else f"{printed:.4f}", *cells])
     columns = (
         Column("quantity"),
