@@ -28,13 +28,18 @@ REST_RATIO = 3.0
 """At rest the block means of a window scatter by less than so many times what the sensor's noise gives them."""
 LEAST_WINDOWS = 8
 LEAST_SPAN_DEGC = 3.0
+CUBIC_WINDOWS = 16
 ITERATIONS = 20
 
 
 @dataclass(frozen=True)
 class WarmUp:
     """`zero_per_degc`, `sd` (3,) in logged units per °C; `zero` (3,) at `temperature_degc`, their mean; windows used
-    and the temperatures they span."""
+    and the temperatures they span.
+
+    `bend` (3, 3), an axis a row: coefficients of x, x² and x³, x = (T − temperature_degc)/`width_degc`, with covariance
+    (3, 3, 3) by axis; None where the windows are too few for a cubic.
+    """
 
     zero_per_degc: Array
     sd: Array
@@ -42,6 +47,9 @@ class WarmUp:
     temperature_degc: float
     n_windows: int
     span_degc: float
+    width_degc: float
+    bend: Array | None
+    bend_covariance: Array | None
 
 
 def rest_windows(t: ArrayLike, logged: ArrayLike, *, max_gap_s: float = 0.1) -> tuple[Array, Array]:
@@ -79,7 +87,8 @@ def rest_windows(t: ArrayLike, logged: ArrayLike, *, max_gap_s: float = 0.1) -> 
 def fit_warm_up(t: ArrayLike, logged: ArrayLike, temperature_degc: ArrayLike, *, max_gap_s: float = 0.1) -> WarmUp:
     """Slope of the gyroscope's zero on temperature from one flight's windows at rest.
 
-    Straight line by Huber weights (a window of slow, steady turning is an outlier), its sd from the coloured residuals.
+    Straight line, and a cubic beside it, by Huber weights (a window of slow, steady turning is an outlier), their
+    covariance from the coloured residuals.
     What changes with time as the IMU warms up, gradients inside it for instance, is in the slope: a flight that warms
     up quickly need not agree with flights at different temperatures.
 
@@ -117,15 +126,21 @@ def fit_warm_up(t: ArrayLike, logged: ArrayLike, temperature_degc: ArrayLike, *,
     x = np.column_stack([np.ones(len(warm)), warm - centre])
     slope, sd, zero = np.empty(3), np.empty(3), np.empty(3)
     for axis in range(3):
-        beta, covariance = _line(x, means[:, axis])
+        beta, covariance = _robust(x, means[:, axis])
         zero[axis], slope[axis], sd[axis] = beta[0], beta[1], np.sqrt(covariance[1, 1])
-    return WarmUp(slope, sd, zero, centre, len(middles), span)
+    width = float(np.abs(x[:, 1]).max())
+    if len(middles) < CUBIC_WINDOWS:
+        return WarmUp(slope, sd, zero, centre, len(middles), span, width, None, None)
+    powers = np.vander(x[:, 1] / width, 4, increasing=True)
+    bends = [_robust(powers, means[:, axis]) for axis in range(3)]
+    bend, bend_covariance = np.stack([b[1:] for b, _ in bends]), np.stack([v[1:, 1:] for _, v in bends])
+    return WarmUp(slope, sd, zero, centre, len(middles), span, width, bend, bend_covariance)
 
 
-def _line(x: Array, y: Array) -> tuple[Array, Array]:
-    """Huber's straight line and its covariance."""
+def _robust(x: Array, y: Array) -> tuple[Array, Array]:
+    """Huber's regression and its covariance."""
     weight: Array = np.ones(len(y))
-    beta: Array = np.zeros(2)
+    beta: Array = np.zeros(x.shape[1])
     for _ in range(ITERATIONS):
         root = np.sqrt(weight)
         new = np.linalg.lstsq(x * root[:, None], y * root, rcond=None)[0]

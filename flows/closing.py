@@ -11,7 +11,7 @@ from typing import Any
 
 from fieldcal.configuration import Alerts
 from fieldcal.provenance import source_digest
-from flows import drift, drift_reasons, drift_warm_up
+from flows import drift, drift_curve, drift_reasons, drift_warm_up
 from flows.drift_changes import Change, changes, last_usable
 from warehouse import Warehouse
 from warehouse.checksums import history_digest
@@ -19,7 +19,7 @@ from warehouse.files import write_bytes
 from warehouse.lock import fleet_lock
 from warehouse.sealed import BrokenSeal, seal, unseal
 
-INPUTS = ("calibration", "fit", "flight", "sync")
+INPUTS = ("calibration", "fit", "flight", "run", "sync")
 EVENT = "fieldcal.fleet.changed"
 MOST_PAGES = 10
 
@@ -85,7 +85,7 @@ def _made_from(root: Path) -> str:
     """Digest of what trends are made from: the history and the code."""
     digest = hashlib.sha256(history_digest(root, INPUTS).encode())
     digest.update(source_digest(drift.update_drift).encode())
-    for module in (drift, drift_reasons, drift_warm_up):
+    for module in (drift, drift_curve, drift_reasons, drift_warm_up):
         digest.update(Path(str(module.__file__)).read_bytes())
     return digest.hexdigest()
 

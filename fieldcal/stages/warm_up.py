@@ -11,6 +11,8 @@ from fieldcal.results import StageResult
 from fieldcal.stages.inputs import Settings, Tables
 
 METHOD, PARAMETER = "warm_up", "zero_per_degc"
+CURVE = "zero_over_temperature"
+"""What stands in `measured`: the zero as a cubic of temperature, level left out, an axis a row."""
 
 
 def find_warm_up(tables: Tables, s: Settings) -> StageResult:
@@ -44,4 +46,13 @@ def find_warm_up(tables: Tables, s: Settings) -> StageResult:
         for i, axis in enumerate(AXES)
     ]
     measured = {"rest_windows": found.n_windows, "span_degc": found.span_degc, "zero": found.zero.tolist()}
+    if found.bend is not None and found.bend_covariance is not None:
+        measured |= {
+            CURVE: {
+                "centre_degc": found.temperature_degc,
+                "width_degc": found.width_degc,
+                "coefficients": found.bend.tolist(),
+                "covariance": found.bend_covariance.tolist(),
+            }
+        }
     return StageResult({"calibration": calibration_rows(rows)}, measured=measured)
