@@ -16,6 +16,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -49,9 +50,9 @@ ROW_METHOD = {"serial": {"gyroscope": "output_error"}, "joint": dict.fromkeys(SE
 Figures = dict[str, list[float]]
 
 
-def measure(recording: Recording, method: str) -> Iterator[tuple[str, float]]:
-    """(quantity, error) of one flight; "refused …" counts."""
-    own = settings(recording.experiment, method=method, lever_arm_m=None)
+def measure(recording: Recording, method: str, **changes: Any) -> Iterator[tuple[str, float]]:
+    """(quantity, error) of one flight; "refused …" counts. `changes` replace parameters."""
+    own = settings(recording.experiment, method=method, lever_arm_m=None, **changes)
     results = run_flight(signals(recording), own)
     squares, beyond = [], []
     for name in SENSORS:

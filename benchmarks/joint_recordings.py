@@ -1,6 +1,6 @@
 """Open-loop attitude drift on real recordings with optical poses: gyroscope as logged, after serial, after joint.
 
-    python benchmarks/joint_recordings.py ARCHIVE LOG [LOG …]
+    python benchmarks/joint_recordings.py ARCHIVE LOG [LOG …] [--use-vps]
 
 ARCHIVE holds fieldcal.toml and `expected.json` with reference gyroscope constants (`truth.gyro` of each log, rad/s);
 LOGs are relative to it. The gyroscope is integrated over each contiguous segment from its best start and compared with
@@ -32,6 +32,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("archive", type=Path)
     parser.add_argument("log", nargs="+")
+    parser.add_argument("--use-vps", action="store_true", help="the optical attitude in the estimate")
     given = parser.parse_args()
     configuration = load(given.archive / "fieldcal.toml")
     reference = json.loads((given.archive / "expected.json").read_text())
@@ -41,7 +42,7 @@ def main() -> None:
         path = given.archive / name
         vehicle = configuration.vehicle(path.parent.parent.name)
         signals, facts = ingest.read_flight(path, vehicle)
-        settings = ingest.settings_of(facts, vehicle) | {"method": "joint"}
+        settings = ingest.settings_of(facts, vehicle) | {"method": "joint", "use_vps": given.use_vps}
         results = run_flight(signals, settings)
         drift = [_raw_drift(results, settings), *(_drift(results, m) for m in ("output_error", "joint"))]
         cells = ["–" if value is None else f"{value:.2f}°" for value in drift]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtr
 
 from fieldcal.random_effects import summed
 from fieldcal.rotation import Array
@@ -128,7 +128,7 @@ def strongest_step(
     t = np.sqrt(gain[best] / np.maximum(left, LEAST_SQUARES))
     tried = np.bincount(row, possible.astype(float), n_rows)[rows]
     index[rows] = best
-    p_value[rows] = np.where(freedom > 0, np.minimum(1.0, tried * 2.0 * stats.t.sf(t, np.maximum(freedom, 1))), 1.0)
+    p_value[rows] = np.where(freedom > 0, np.minimum(1.0, tried * 2.0 * stdtr(np.maximum(freedom, 1), -t)), 1.0)
     return index, p_value
 
 

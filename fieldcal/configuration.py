@@ -246,8 +246,6 @@ def _imu_fields(value: Any, place: Place) -> dict[str, Paths]:
 
 
 def _parameters(value: Any, place: Place) -> dict[str, Value]:
-    if isinstance(value, dict) and value.get("use_vps") is True:
-        (place / "use_vps").fail("not_available", "this version cannot use the VPS in the estimate; leave it false")
     return {key: _parameter(key, item, place / key) for key, item in check.table(value, place, PARAMETERS).items()}
 
 

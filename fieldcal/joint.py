@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fieldcal.errors import EstimationError
-from fieldcal.joint_chain import Joints, Normal, Probe, add_joints, joint_squares, solve_scaled
-from fieldcal.joint_covariance import covariance
+from fieldcal.joint_chain import GRADIENT, SENSORS, Joints, Normal, Probe, add_joints, joint_squares, solve_scaled
+from fieldcal.joint_covariance import covariance, inverse_information
 from fieldcal.joint_model import (
     SENSED,
+    TRIADS,
     Model,
     Rows,
     State,
@@ -29,6 +30,7 @@ from fieldcal.joint_model import (
     sensitivities,
     trajectory,
 )
+from fieldcal.joint_vps import VpsRecord
 from fieldcal.rotation import Array, body_from_inertial
 from fieldcal.statistics import robust_sigma, white_noise_sigma
 
@@ -43,9 +45,11 @@ LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
 MOST_WALK = 10.0
 STIFFENING = 4.0
 LEAST_ACCELERATION_MPS2, LEAST_WALK, LEAST_VARIANCE = 2e-3, 1e-9, 1e-8
+# Bounds of a step of a variance: the translation may vanish, the walk is what ties the attitudes.
+LEAST_RATIO, MOST_RATIO = np.array([0.25, 0.01]), np.array([4.0, 10.0])
 MAX_ITERATIONS = 50
 # Settled: every step below this part of what one could claim as standard deviation, every noise level below it too.
-SETTLED = 0.05
+SETTLED = 0.1
 ROUNDING = 1e-8  # of centred parameters, which are of order one: nothing left to gain
 # Wald test of the lever arm, χ²₃: passed by chance once in a thousand.
 LEVER_ARM_GATE = 16.3
@@ -83,6 +87,7 @@ class JointFit:
     information: Array
     iterations: int
     lever_arm_test: float | None = None
+    vps: VpsRecord | None = None
 
     def constants(self, name: str) -> tuple[Array, Array, Array]:
         """(λ (3,), b (3,), covariance (6, 6)) of a triad in logged units."""
@@ -91,7 +96,15 @@ class JointFit:
         return value[:3], value[3:], transform @ self.covariance[own, own] @ transform.T
 
 
-def fit_joint(model: Model, start: State, *, free_dip: bool = True, try_lever_arm: bool = True) -> JointFit:
+def fit_joint(
+    model: Model,
+    start: State,
+    *,
+    free_dip: bool = True,
+    try_lever_arm: bool = True,
+    vps: VpsRecord | None = None,
+    levels: Levels | None = None,
+) -> JointFit:
     """Estimate everything from a start within some tens of per cent.
 
     Parameters
@@ -100,12 +113,16 @@ def fit_joint(model: Model, start: State, *, free_dip: bool = True, try_lever_ar
         The record, knots placed.
     start : State
         Attitudes of the knots within about 30°, constants with the right polarity. Its lever arm is kept unless
-        `try_lever_arm`.
+        `try_lever_arm`. Optional terms (`joint_model.OPTIONAL`) that it has a value for are estimated too.
     free_dip : bool
         Estimate the dip angle; otherwise that of the configured field holds.
     try_lever_arm : bool
         Estimate the lever arm, and keep it only where it differs from none (Wald test): estimating it on data that do
         not show it costs accuracy.
+    vps : VpsRecord, optional
+        Reference attitudes; `start` then holds `VpsRecord.start()` too.
+    levels : Levels, optional
+        Noise to start from, that of a fit nearby.
 
     Raises
     ------
@@ -122,21 +139,41 @@ def fit_joint(model: Model, start: State, *, free_dip: bool = True, try_lever_ar
     with the vehicle other than hard iron.
     """
     free = try_lever_arm and "accelerometer" in model.rows
-    fit = _iterate(model, start, None, dip=free_dip, lever_arm=free)
+    fit, response = _iterate(model, start, levels, dip=free_dip, lever_arm=free, vps=vps)
     if not free:
-        return fit
-    own = fit.layout["lever_arm"]
-    arm = fit.state.values["lever_arm"]
-    test = float(arm @ np.linalg.solve(fit.covariance[own, own], arm))
+        return _enlarged(fit, response)
+    test = _lever_arm_test(fit)
+    if test >= LEVER_ARM_GATE:  # colour makes it smaller at most
+        fit = _enlarged(fit, response)
+        test = _lever_arm_test(fit)
     if test < LEVER_ARM_GATE:
-        without = replace(fit.state, values={**fit.state.values, "lever_arm": np.zeros(3)})
-        fit = _iterate(model, without, fit.levels, dip=free_dip, lever_arm=False)
+        own = fit.layout["lever_arm"]
+        none = fit.covariance[:, own] @ np.linalg.solve(fit.covariance[own, own], fit.state.values["lever_arm"])
+        without = fit.state.moved(response @ none, -none, fit.layout)
+        without = replace(without, values={**without.values, "lever_arm": np.zeros(3)})
+        fit = _enlarged(*_iterate(model, without, fit.levels, dip=free_dip, lever_arm=False, vps=vps))
     return replace(fit, lever_arm_test=test)
 
 
-def _iterate(model: Model, state: State, levels: Levels | None, *, dip: bool, lever_arm: bool) -> JointFit:
-    """Gauss–Newton with noise levels renewed at every step."""
-    layout, p = layout_of(model, dip=dip, lever_arm=lever_arm)
+def _lever_arm_test(fit: JointFit) -> float:
+    own, arm = fit.layout["lever_arm"], fit.state.values["lever_arm"]
+    return float(arm @ np.linalg.solve(fit.covariance[own, own], arm))
+
+
+def _enlarged(fit: JointFit, response: Array) -> JointFit:
+    """With the covariance that coloured residuals leave; `response` (K, s, p) of the knots to the parameters."""
+    chunks = sensitivities(fit.model, fit.state, fit.path, fit.layout, len(fit.information))
+    whitening = _whitening(fit.weight, fit.levels)
+    poses = None if fit.vps is None else fit.vps.whitened(fit.model, fit.state, fit.path, fit.layout, response)
+    return replace(fit, covariance=covariance(fit.model, chunks, response, fit.information, whitening, poses))
+
+
+def _iterate(
+    model: Model, state: State, levels: Levels | None, *, dip: bool, lever_arm: bool, vps: VpsRecord | None
+) -> tuple[JointFit, Array]:
+    """Gauss–Newton with noise levels renewed at every step: the fit with the inverse information as covariance, and the
+    knots' response N_xx⁻¹N_xθ."""
+    layout, p = layout_of(model, state.values, dip=dip, lever_arm=lever_arm)
     knots, prior = model.knots, _Prior.at(model, state, layout, p)
     probe = Probe.draw(len(model.at), 3 * len(model.rows), len(knots.index))
     path = trajectory(model, state)
@@ -147,37 +184,34 @@ def _iterate(model: Model, state: State, levels: Levels | None, *, dip: bool, le
         normal, moved, reaction = _normal_equations(model, state, path, layout, p, weight, levels, probe)
         joints = Joints(path.jump, moved, levels.walk, state.motion, levels.strength)
         add_joints(normal, knots, joints, probe)
+        if vps is not None:
+            vps.add(normal, model, state, path, layout)
         prior.add(normal, state, layout)
         eliminated, information, gradient = normal.eliminate()
         gradient[layout["gyroscope"].start + np.arange(3), 0] += _logged_units(model, state, path, levels.walk)
         if "accelerometer" in layout:
             own = layout["accelerometer"].start + np.arange(3)
-            gradient[own, 0] += _integrated_translation(model, state, reaction, eliminated[:, :, p + 1])
+            gradient[own, 0] += _integrated_translation(model, state, reaction, eliminated[:, :, p + SENSORS])
         theta = solve_scaled(information, gradient)
-        step, response = (eliminated[:, :, p + i] - eliminated[:, :, :p] @ theta[:, i] for i in (0, 1))
-        least = _least_part(state, step, theta[:, 0], layout)
-        state = state.moved(least * step, least * theta[:, 0], layout)
+        response = eliminated[:, :, p:] - eliminated[:, :, :p] @ theta
+        step, change = response[:, :, GRADIENT], theta[:, GRADIENT]
+        least = _least_part(state, step, change, layout)
+        state = state.moved(least * step, least * change, layout)
         path = trajectory(model, state)
         residual = residuals(model, state, path)
         if not np.isfinite(residual).all():
             break
-        absorbed = np.einsum("kcr,kc->r", reaction[0], response[:, SENSED]) + reaction[1].T @ theta[:, 1]
+        absorbed = np.einsum("kcr,kc->r", reaction[0], response[:, SENSED, SENSORS]) + reaction[1].T @ theta[:, SENSORS]
         joints = replace(joints, jump=path.jump, motion=state.motion)
-        squares = joint_squares(knots, joints, response, theta[:, 1], probe)
+        squares = joint_squares(knots, joints, response, theta, probe)
         renewed = _levels(model, residual, levels, absorbed, squares, MOST_WALK * gyro_walk(model, state))
-        change, levels = _largest_change(levels, renewed), renewed
+        unsettled, levels = _unsettled(levels, renewed, squares), renewed
         claimed = 1.0 / np.sqrt(np.diagonal(information))
-        largest = float(np.max(np.abs(theta[:, 0])))
-        settled = max(change, float(np.max(np.abs(theta[:, 0]) / claimed))) < SETTLED
-        if settled or largest < ROUNDING:
-            coloured = covariance(
-                model,
-                sensitivities(model, state, path, layout, p),
-                eliminated[:, :, :p],
-                information,
-                _whitening(weight, levels),
-            )
-            return JointFit(model, state, path, levels, weight, layout, coloured, information, iteration)
+        settled = max(unsettled, float(np.max(np.abs(change) / claimed))) < SETTLED
+        if settled or float(np.max(np.abs(change))) < ROUNDING:
+            plain = inverse_information(information)
+            fit = JointFit(model, state, path, levels, weight, layout, plain, information, iteration, vps=vps)
+            return fit, eliminated[:, :, :p]
     raise EstimationError(
         "joint_diverged",
         "The joint estimate found no minimum: the readings contradict each other or the start is too far off.",
@@ -202,7 +236,7 @@ def _normal_equations(
 ) -> tuple[Normal, Array, tuple[Array, Array]]:
     """Those of the sensors; ∂(integrated attitude)/∂θ (K−1, 3, p); and every row's own reaction to the probe."""
     knots, rows = len(model.knots.index), 3 * len(model.rows)
-    normal = Normal.empty(knots, p, 2)
+    normal = Normal.empty(knots, p, 4)
     reaction = np.zeros((knots, len(SENSED), rows)), np.zeros((p, rows))
     moved = np.zeros((knots, 3, p))
     whitening = _whitening(weight, levels)
@@ -241,9 +275,9 @@ def _least_part(state: State, step: Array, theta: Array, layout: Mapping[str, sl
     """Part of a step that may be taken: no attitude by more than LARGEST_TURN_RAD, no scale by LARGEST_RELATIVE."""
     longest = [float(np.max(np.abs(step[:, :3]))) / LARGEST_TURN_RAD]
     for name, own in layout.items():
-        if own.stop - own.start == 6:
+        if name in TRIADS:
             scale = np.abs(state.values[name][:3])
-            longest.append(float(np.max(np.abs(theta[own].reshape(2, 3)) / scale)) / LARGEST_RELATIVE)
+            longest.append(float(np.max(np.abs(theta[own][:3]) / scale)) / LARGEST_RELATIVE)
     return 1.0 / max(1.0, *longest)
 
 
@@ -253,7 +287,11 @@ def _first_levels(model: Model, state: State, path: Trajectory, residual: Array)
     variance = np.maximum(sigma**2, LEAST_VARIANCE)
     jumped = np.sum(path.jump**2) / (3.0 * np.sum(model.knots.interval_s * model.knots.joined))
     walk = max(WALK_START * gyro_walk(model, state), float(jumped), LEAST_WALK)
-    return Levels(variance, np.ones(len(variance)), walk, ACCELERATION_START_MPS2)
+    strength = ACCELERATION_START_MPS2
+    if "accelerometer" in model.rows:
+        row = 3 * model.rows.index("accelerometer")
+        strength = max(strength, float(np.max(sigma[row : row + 3] * np.abs(state.values["accelerometer"][:3]))))
+    return Levels(variance, np.ones(len(variance)), walk, strength)
 
 
 def gyro_walk(model: Model, state: State) -> float:
@@ -268,10 +306,11 @@ def _levels(model: Model, residual: Array, levels: Levels, absorbed: Array, squa
     count = weight.sum(axis=0)
     left = np.maximum(count - levels.colour * absorbed, 0.05 * count)
     variance = np.maximum(np.sum(weight * residual**2, axis=0) / left, LEAST_VARIANCE)
-    square, number, taken = squares.T
-    ratio = np.clip(square / np.maximum(number - taken, 0.02 * number), 0.1, 10.0)
-    # On its way to nothing the translation creeps: more than the plain step there.
-    walk, strength = levels.walk * ratio[0], levels.strength * ratio[1] ** (0.8 if ratio[1] < 1.0 else 0.5)
+    # Upwards the fixed point; downwards halfway to Newton's method, whose steps follow a variance to nothing.
+    square, free, information = np.maximum(squares.T, 1e-9)
+    number = np.where(square < free, np.sqrt(free * np.minimum(information, free)), free)
+    ratio = np.clip(1.0 + (square - free) / number, LEAST_RATIO, MOST_RATIO)
+    walk, strength = levels.walk * ratio[0], levels.strength * np.sqrt(ratio[1])
     return Levels(
         variance,
         _colour(model, residual, weight),
@@ -281,10 +320,13 @@ def _levels(model: Model, residual: Array, levels: Levels, absorbed: Array, squa
     )
 
 
-def _largest_change(before: Levels, after: Levels) -> float:
-    """Largest relative change of a noise variance."""
+def _unsettled(before: Levels, after: Levels, squares: Array) -> float:
+    """Largest relative change of a noise variance; of walk and translation in standard deviations where one could claim
+    less than their own size."""
     old, new = (np.r_[v.variance, v.walk, v.strength**2] for v in (before, after))
-    return float(np.max(np.abs(new / old - 1.0)))
+    change = np.abs(new / old - 1.0)
+    change[-2:] *= np.minimum(1.0, np.sqrt(0.5 * squares[:, 2]))
+    return float(np.max(change))
 
 
 def _robust_weight(model: Model, residual: Array, levels: Levels) -> Array:

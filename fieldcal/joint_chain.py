@@ -1,11 +1,11 @@
-"""The attitude and motion of a whole record as one chain of knots: its process noise and its banded normal equations.
+"""The attitude and motion of a whole record as one chain of knots: its process noise and its normal equations.
 
 Multiple shooting with soft joints. Between neighbouring knots the gyroscope is integrated; where one interval ends and
 the next begins the attitude may jump by what gyroscope noise makes of the interval. Beside the attitude a knot carries
 the translation that the accelerometer senses: velocity, acceleration and jerk of a velocity that is white noise behind
 three equal low-passes, so that the acceleration has no constant part, as that of a vehicle that stays in sight. All
-knots are eliminated from the normal equations at once by a banded Cholesky factor (the Schur complement), in time
-linear in the record's length.
+knots are eliminated from the normal equations by block cyclic reduction (the Schur complement), in time linear in the
+record's length.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError, expm, solve_continuous_lyapunov, solveh_banded
+from scipy.linalg import expm, solve_continuous_lyapunov
 
 from fieldcal.errors import EstimationError
 from fieldcal.rotation import Array
@@ -22,6 +22,8 @@ from fieldcal.rotation import Array
 MOTION_HZ = 0.7
 ORDER = 3  # velocity, acceleration, jerk, scaled to m/s²
 STATES = 3 + 3 * ORDER  # attitude error first
+# Right-hand sides after the parameters: the gradient, and what the unknowns make of each group's probe.
+GRADIENT, SENSORS, JUMP, MOTION = range(4)
 WEAK = 1e-2  # 1/rad²: keeps directions that nothing observes (heading without a magnetometer) from being singular
 
 
@@ -108,32 +110,44 @@ class Normal:
         )
 
     def eliminate(self) -> tuple[Array, Array, Array]:
-        """Knots eliminated by a banded Cholesky factor: N_xx⁻¹ right (K, s, c), information of θ (p, p) (the Schur
+        """Knots eliminated (`chain_solve`): N_xx⁻¹ right (K, s, c), information of θ (p, p) (the Schur
         complement N_θθ − N_θx N_xx⁻¹ N_xθ), gradients (p, c − p). Raises EstimationError `joint_singular`."""
         p = len(self.parameters)
-        eliminated = banded_solve(self.diagonal, self.below, self.right)
+        eliminated = chain_solve(self.diagonal, self.below, self.right)
         flat, solved = (x.reshape(-1, x.shape[2]) for x in (self.right, eliminated))
-        information = self.parameters - flat[:, :p].T @ solved[:, :p]
-        gradient = self.parameters_right - flat[:, :p].T @ solved[:, p:]
+        taken = (flat.T @ solved)[:p]
+        information, gradient = self.parameters - taken[:, :p], self.parameters_right - taken[:, p:]
         return eliminated, 0.5 * (information + information.T), gradient
 
 
-def banded_solve(diagonal: Array, below: Array, right: Array) -> Array:
-    """Solve the block tridiagonal system with blocks (K, m, m), (K−1, m, m) for right-hand sides (K, m, c)."""
-    k, m = diagonal.shape[:2]
-    band = np.zeros((2 * m, k * m))
-    for a in range(m):
-        for b in range(m):
-            if b <= a:
-                band[a - b, b::m] = diagonal[:, a, b]
-            band[m + a - b, b : (k - 1) * m : m] = below[:, a, b]
+def chain_solve(diagonal: Array, below: Array, right: Array) -> Array:
+    """Solve the positive block tridiagonal system with blocks (K, m, m), (K−1, m, m) for right-hand sides (K, m, c).
+
+    Block cyclic reduction: every other knot is eliminated at once, which leaves a chain of half the length; each level
+    is a handful of products of stacked blocks. Raises EstimationError `joint_singular`."""
     try:
-        solved = solveh_banded(band, right.reshape(k * m, -1), lower=True, overwrite_ab=True, check_finite=False)
-    except (LinAlgError, ValueError) as error:
+        root = np.linalg.inv(np.linalg.cholesky(diagonal[1::2] if len(diagonal) > 1 else diagonal))
+    except np.linalg.LinAlgError as error:
         raise EstimationError(
             "joint_singular", "The joint equations are singular: the readings contradict the start."
         ) from error
-    return np.asarray(solved.reshape(right.shape))
+    inverse = root.transpose(0, 2, 1) @ root
+    if len(diagonal) == 1:
+        return np.asarray(inverse @ right)
+    odd, before, after = len(inverse), below[0::2], below[1::2]  # an odd knot below the even before it; the next below
+    forth = inverse[: len(after)] @ after.transpose(0, 2, 1)
+    back, own = inverse @ before, inverse @ right[1::2]
+    even, rest = diagonal[0::2].copy(), right[0::2].copy()
+    even[:odd] -= before.transpose(0, 2, 1) @ back
+    even[1:] -= after @ forth
+    rest[:odd] -= before.transpose(0, 2, 1) @ own
+    rest[1:] -= after @ own[: len(after)]
+    solved = np.empty_like(right)
+    solved[0::2] = chain_solve(even, -after @ back[: len(after)], rest)
+    own -= back @ solved[0::2][:odd]
+    own[: len(after)] -= forth @ solved[2::2]
+    solved[1::2] = own
+    return solved
 
 
 def solve_scaled(information: Array, gradient: Array) -> Array:
@@ -166,14 +180,15 @@ def add_joints(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> No
     normal.diagonal[:, range(3), range(3)] += WEAK
     normal.below[:, :3, :3] -= eye
     coupling = joints.moved * weight[:, None, None]
-    rights = np.stack([-joints.jump * weight[:, None], probe.jump * np.sqrt(weight)[:, None]], axis=2)
+    rights = np.zeros((len(weight), 3, normal.right.shape[2] - p))
+    rights[..., GRADIENT], rights[..., JUMP] = -joints.jump * weight[:, None], probe.jump * np.sqrt(weight)[:, None]
     normal.right[1:, :3, :p] -= coupling
     normal.right[:-1, :3, :p] += coupling
     normal.right[1:, :3, p:] += rights
     normal.right[:-1, :3, p:] -= rights
     flat = joints.moved.reshape(-1, p)
     normal.parameters += flat.T @ coupling.reshape(-1, p)
-    normal.parameters_right -= flat.T @ rights.reshape(-1, 2)
+    normal.parameters_right -= flat.T @ rights.reshape(len(flat), -1)
     _add_motion(normal, knots, joints, probe)
 
 
@@ -199,7 +214,7 @@ def _add_motion(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> N
             into[:, own, own] += block
     y = joints.motion.reshape(-1, ORDER, 3)
     drawn = (probe.motion * knots.joined[:, None, None], probe.start)
-    for column, (step, start) in enumerate(((behind @ y[:-1] - ahead @ y[1:], -(first @ y)), drawn)):
+    for column, (step, start) in ((GRADIENT, (behind @ y[:-1] - ahead @ y[1:], -(first @ y))), (MOTION, drawn)):
         right = begin @ start
         right[1:] += forth @ step
         right[:-1] -= back @ step
@@ -207,19 +222,25 @@ def _add_motion(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> N
 
 
 def joint_squares(knots: Knots, joints: Joints, state: Array, theta: Array, probe: Probe) -> Array:
-    """(2, 3): for attitude jumps and for the translation, the whitened squares, how many, and how many of those the
-    unknowns absorb: their response to the probe, `state` (K, s) and `theta` (p,), against the probe itself."""
+    """(2, 3): for attitude jumps and for the translation, the whitened squares s, how many of them are free e = tr M,
+    and tr M² for M = I − (what the unknowns absorb). ½(s − e) and ½ tr M² are score and information of the logarithm
+    of the group's variance.
+
+    `state` (K, s, c) and `theta` (p, c) are the responses to the right-hand sides: those to the groups' own probes z
+    give e = zᵀMz and tr M² = ‖Mz‖²."""
     root = np.sqrt(knots.joined / (joints.walk * knots.interval_s))[:, None]
-    response = root * (state[1:, :3] - state[:-1, :3] - joints.moved @ theta)
+    by_jump, by_motion = state[..., JUMP], state[..., MOTION]
+    left = probe.jump * knots.joined[:, None]
+    left = left - root * (by_jump[1:, :3] - by_jump[:-1, :3] - joints.moved @ theta[:, JUMP])
     ahead, behind, first = _process(knots, joints.strength)
-    y, dy = (x.reshape(-1, ORDER, 3) for x in (joints.motion, state[:, 3:]))
-    moved = probe.motion * (ahead @ dy[1:] - behind @ dy[:-1])
+    y, dy = (x.reshape(-1, ORDER, 3) for x in (joints.motion, by_motion[:, 3:]))
+    drawn = probe.motion * knots.joined[:, None, None], probe.start * np.r_[True, ~knots.joined][:, None, None]
+    steps, starts = drawn[0] - (ahead @ dy[1:] - behind @ dy[:-1]), drawn[1] - first @ dy
     square = np.sum((ahead @ y[1:] - behind @ y[:-1]) ** 2) + np.sum((first @ y) ** 2)
-    joined, segments = int(knots.joined.sum()), 1 + int(np.sum(~knots.joined))
     return np.array(
         [
-            [np.sum((root * joints.jump) ** 2), 3 * joined, np.sum(probe.jump * response)],
-            [square, 3 * ORDER * (joined + segments), np.sum(moved) + np.sum(probe.start * (first @ dy))],
+            [np.sum((root * joints.jump) ** 2), np.sum(probe.jump * left), np.sum(left**2)],
+            [square, np.sum(drawn[0] * steps) + np.sum(drawn[1] * starts), np.sum(steps**2) + np.sum(starts**2)],
         ]
     )
 

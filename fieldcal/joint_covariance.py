@@ -17,6 +17,7 @@ def covariance(
     response: Array,
     information: Array,
     whitening: Array,
+    others: tuple[Array, Array] | None = None,
 ) -> Array:
     """Covariance (p, p) of θ: the inverse information, enlarged where the sensors' residuals are coloured.
 
@@ -34,6 +35,8 @@ def covariance(
         Of θ, knots eliminated.
     whitening : (m, r) array
         Weights over low-frequency variance.
+    others : (K, c, p), (K, c) arrays, optional
+        Whitened sensitivities, knots eliminated, and residuals of what else was measured at the knots.
     """
     inverse = inverse_information(information)
     k, r, p = len(response), whitening.shape[1], len(information)
@@ -44,8 +47,8 @@ def covariance(
         after = np.minimum(knot + 1, k - 1)
         between = (1.0 - share) * response[knot][:, SENSED] + share * response[after][:, SENSED]
         root = np.sqrt(whitening[rows.own])
-        left = (rows.by_parameter - rows.by_knot @ between) * root[..., None]
-        sensitivity[ties] = sums_by_interval(model, left.reshape(len(at), -1), rows.own, ties).reshape(-1, r, p)
+        own = (rows.by_parameter - rows.by_knot @ between) * root[..., None]
+        sensitivity[ties] = sums_by_interval(model, own.reshape(len(at), -1), rows.own, ties).reshape(-1, r, p)
         residual[ties] = sums_by_interval(model, rows.residual * root, rows.own, ties)
         count[ties] = sums_by_interval(model, (root > 0).astype(float), rows.own, ties)
     scale = 1.0 / np.sqrt(np.maximum(count, 1.0))
@@ -56,6 +59,10 @@ def covariance(
         variance = float(np.mean(e**2))
         if variance > 0.0:
             excess += coloured_information(s[:, None, :], e[:, None]) / variance - s.T @ s
+    if others is not None:
+        seen, left = others
+        variance = float(np.mean(left[left != 0.0] ** 2)) if left.any() else 1.0
+        excess += coloured_information(seen, left) / variance - np.einsum("kcp,kcq->pq", seen, seen)
     coloured = np.diagonal(inverse @ excess @ inverse)
     plain = np.diagonal(inverse)
     enlarged = np.sqrt(np.maximum(1.0, 1.0 + coloured / plain))

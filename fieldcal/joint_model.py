@@ -9,12 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fieldcal.gyro_equation import from_centred
-from fieldcal.joint_chain import Knots, Normal, Probe
+from fieldcal.joint_chain import GRADIENT, SENSORS, Knots, Normal, Probe
 from fieldcal.rotation import (
     Array,
     body_from_inertial,
     conjugate,
-    cumulative_product,
     from_rotation_vector,
     multiply,
     rotation_steps,
@@ -26,7 +25,10 @@ CHUNK_ROWS = 8192
 MAX_TURN_RAD, MAX_AVERAGE_S = 0.1, 0.02
 ACCELERATION = slice(3, 6)  # of a knot's translation
 SENSED = np.array([0, 1, 2, 6, 7, 8])  # of a knot's states: attitude and acceleration
+BLOCKS = ((slice(0, 3), slice(0, 3)), (slice(6, 9), slice(3, 6)))  # the same by slices: of the states, of SENSED
 TRIADS = ("gyroscope", "accelerometer", "magnetometer")
+# What a start may hold beside constants, and how many numbers that is (`joint_vps`).
+OPTIONAL = {"vps_clock": 2, "vps_world": 3, "vps_body": 3}
 
 
 @dataclass(frozen=True)
@@ -164,16 +166,28 @@ def trajectory(model: Model, state: State) -> Trajectory:
     knots, t = model.knots, model.readings.t
     gyro = state.values["gyroscope"]
     rate = gyro[:3] * model.triads["gyroscope"].x + gyro[3:]
-    steps = from_rotation_vector(rotation_steps(t, rate))
-    broken = model.readings.segment[1:] != model.readings.segment[:-1]
-    steps[broken] = 0.0, 0.0, 0.0, 1.0
-    total = cumulative_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], steps]))
-    at_knots = total[knots.index]
-    start = multiply(state.q, conjugate(at_knots))
-    jump = to_rotation_vector(multiply(state.q[1:], conjugate(multiply(start[:-1], at_knots[1:]))))
+    since, ends = _since_knots(knots, from_rotation_vector(rotation_steps(t, rate)))
+    jump = to_rotation_vector(multiply(state.q[1:], conjugate(multiply(state.q[:-1], ends))))
     jump[~knots.joined] = 0.0
     spread = knots.share[:, None] * np.r_[jump, np.zeros((1, 3))][knots.of_sample]
-    return Trajectory(multiply(from_rotation_vector(spread), multiply(start[knots.of_sample], total)), rate, jump)
+    return Trajectory(multiply(from_rotation_vector(spread), multiply(state.q[knots.of_sample], since)), rate, jump)
+
+
+def _since_knots(knots: Knots, steps: Array) -> tuple[Array, Array]:
+    """Rotation (n, 4) since the knot before each sample and over each interval (K−1, 4) from steps (n−1, 4) between
+    samples: a scan in step over all intervals."""
+    count = np.diff(knots.index)
+    step = np.arange(int(count.max()))[:, None]
+    nothing = np.array([0.0, 0.0, 0.0, 1.0])
+    own = np.where(
+        ((step < count) & knots.joined)[..., None], steps[np.minimum(knots.index[:-1] + step, len(steps) - 1)], nothing
+    )
+    total = np.empty((len(step) + 1, len(count) + 1, 4))
+    total[0], total[:, -1] = nothing, nothing
+    for i in range(len(step)):
+        total[i + 1, :-1] = multiply(total[i, :-1], own[i])
+    offset = np.arange(len(steps) + 1) - knots.index[knots.of_sample]
+    return total[offset, knots.of_sample], total[count, np.arange(len(count))]
 
 
 @dataclass(frozen=True)
@@ -192,9 +206,11 @@ def lever_arm_geometry(model: Model, state: State, own: slice) -> Array:
     scaled = state.values["gyroscope"]
     gyro = model.triads["gyroscope"]
     scale = scaled[:3] / gyro.spread
-    rate, change = model.readings.turning[:, model.at[own]]
-    turn = skew(scale * (rate - gyro.centre) + scaled[3:])
-    return np.asarray(skew(scale * change) + turn @ turn)
+    low_passed, change = model.readings.turning[:, model.at[own]]
+    rate = scale * (low_passed - gyro.centre) + scaled[3:]
+    geometry = skew(scale * change) + rate[:, :, None] * rate[:, None, :]
+    geometry[:, range(3), range(3)] -= np.sum(rate**2, axis=1)[:, None]
+    return np.asarray(geometry)
 
 
 def residuals(model: Model, state: State, path: Trajectory) -> Array:
@@ -283,19 +299,23 @@ def _turned_by_gyroscope(model: Model, path: Trajectory, own: slice, ties: slice
     first = int(knots.index[ties.start])
     last = int(knots.index[min(ties.stop, len(knots.index) - 1)])  # the last interval ends at the next chunk's knot
     reach = slice(first, last + 1)
-    x = model.triads["gyroscope"].x[reach]
-    r_nb = body_from_inertial(path.q[reach]).transpose(0, 2, 1)
-    integrand = np.concatenate([r_nb * x[:, None, :], r_nb], axis=2).reshape(len(x), 18)
+    x = model.triads["gyroscope"].x[reach].T
+    r_nb = body_from_inertial(path.q[reach]).transpose(2, 1, 0)
+    integrand = np.empty((3, 6, x.shape[1]))  # samples last: long runs for the sums
+    np.multiply(r_nb, x, out=integrand[:, :3])
+    integrand[:, 3:] = r_nb
+    area = integrand[..., 1:] + integrand[..., :-1]
+    area *= 0.5 * np.diff(t[reach])
     total = np.zeros_like(integrand)
-    np.cumsum(0.5 * np.diff(t[reach])[:, None] * (integrand[1:] + integrand[:-1]), axis=0, out=total[1:])
-    total = total.reshape(-1, 3, 6)
-    at_knots = total[knots.index[ties] - first]
-    following = np.r_[knots.index[ties][1:] - first, len(x) - 1]
-    ends = total[following] - at_knots
-    ends[~np.r_[knots.joined, False][ties]] = 0.0
+    np.cumsum(area, axis=2, out=total[..., 1:])
+    at_knots = total[..., knots.index[ties] - first]
+    following = np.r_[knots.index[ties][1:] - first, x.shape[1] - 1]
+    ends = total[..., following] - at_knots
+    ends[..., ~np.r_[knots.joined, False][ties]] = 0.0
     at = model.at[own]
     k = knots.of_sample[at] - ties.start
-    return total[at - first] - at_knots[k] - knots.share[at, None, None] * ends[k], ends
+    moved = total[..., at - first] - at_knots[..., k] - knots.share[at] * ends[..., k]
+    return np.ascontiguousarray(moved.transpose(2, 0, 1)), ends.transpose(2, 0, 1)
 
 
 def accumulate(
@@ -304,42 +324,44 @@ def accumulate(
     """Add a chunk's rows, whitened by `weight` (m, r) = 1/σ² with robust weights in, to the normal equations.
 
     `groups` ((K, 6, r), (p, r)) collect each row's own reaction to the probe."""
-    p = len(normal.parameters)
+    p, (m, r) = len(normal.parameters), weight.shape
     root = np.sqrt(weight)
-    h, g = rows.by_knot * root[..., None], rows.by_parameter * root[..., None]
-    signs = probe.sensors[rows.own] * (root > 0)
     share = model.knots.share[model.at[rows.own], None, None]
-    m, r = signs.shape
-    met = np.zeros((m + 1, r, 12 + p + 1 + r))  # one row of nothing, to fill shorter intervals with
-    met[:m, :, :6], met[:m, :, 6:12] = (1.0 - share) * h, share * h  # knot before, knot after
-    met[:m, :, 12 : 12 + p], met[:m, :, 12 + p] = g, rows.residual * root
-    met[:m, range(r), range(13 + p, 13 + p + r)] = signs
-    met = np.take(met, _padded(model, rows.own, ties), axis=0).reshape(ties.stop - ties.start, -1, met.shape[2])
-    product = met[..., :12].transpose(0, 2, 1) @ met  # (knots, 12, 12 + p + 1 + r)
-    here = np.arange(ties.start, ties.stop)
-    inside = here + 1 < len(normal.diagonal)
-    following = here[inside] + 1
-    pair = (slice(None), SENSED[:, None], SENSED[None, :])
-    for into, knot, part in (
-        (normal.diagonal, here, product[:, :6, :6]),
-        (normal.diagonal, following, product[inside, 6:, 6:12]),
-        (normal.below, here[inside], product[inside, 6:, :6]),
-    ):
-        block = into[knot]
-        block[pair] += part
-        into[knot] = block
-    for knot, part in ((here, product[:, :6, 12:]), (following, product[inside, 6:, 12:])):
-        right = normal.right[knot]
-        right[:, SENSED, : p + 1] += part[..., : p + 1]
-        right[:, SENSED, p + 1] += part[..., p + 1 :].sum(axis=2)
-        normal.right[knot] = right
-        groups[0][knot] += part[..., p + 1 :]
-    flat = g.reshape(-1, p)
-    normal.parameters += flat.T @ flat
-    normal.parameters_right[:, 0] += flat.T @ (rows.residual * root).reshape(-1)
-    own_reaction = np.einsum("nrp,nr->pr", g, signs)
-    normal.parameters_right[:, 1] += own_reaction.sum(axis=1)
-    groups[1][:] += own_reaction
+    met = np.empty((m + 1, r, 12 + p + 1))
+    met[m] = 0.0  # one row of nothing, to fill shorter intervals with
+    before, after, given = met[:m, :, :6], met[:m, :, 6:12], met[:m, :, 12:]
+    np.multiply(rows.by_knot, root[..., None], out=before)
+    np.multiply(before, share, out=after)
+    np.subtract(before, after, out=before)
+    np.multiply(rows.by_parameter, root[..., None], out=given[..., :p])
+    np.multiply(rows.residual, root, out=given[..., p])
+    by_interval = np.take(met, _padded(model, rows.own, ties), axis=0).reshape(ties.stop - ties.start, -1, 13 + p)
+    product = by_interval[..., :12].transpose(0, 2, 1) @ by_interval  # (knots, 12, 13 + p)
+    flat = given.reshape(-1, p + 1)
+    total = flat.T @ flat
+    normal.parameters += total[:p, :p]
+    normal.parameters_right[:, GRADIENT] += total[:p, p]
+    reaction = met[:m] * (probe.sensors[rows.own] * (root > 0))[..., None]
+    own = reaction[..., 12:-1].sum(axis=0).T
+    normal.parameters_right[:, SENSORS] += own.sum(axis=1)
+    groups[1][:] += own
+    pulled = sums_by_interval(model, reaction[..., :12].reshape(m, -1), rows.own, ties).reshape(-1, r, 12)
+    pulled = pulled.transpose(0, 2, 1)
+    # Chain blocks: an interval's rows pull at the knot before it and, where the record goes on, at the one after.
+    last = min(ties.stop, len(normal.diagonal) - 1)
+    inside, following = slice(0, last - ties.start), slice(ties.start + 1, last + 1)
+    for knot, part, here in ((ties, slice(0, 6), slice(None)), (following, slice(6, 12), inside)):
+        groups[0][knot] += pulled[here, part]
+        right = np.concatenate([product[here, part, 12:], pulled[here, part].sum(axis=2, keepdims=True)], axis=2)
+        for state, own_part in BLOCKS:
+            normal.right[knot, state, : p + 2] += right[:, own_part]
+            for other, other_part in BLOCKS:
+                columns = slice(part.start + other_part.start, part.start + other_part.stop)
+                normal.diagonal[knot, state, other] += product[here, part, columns][:, own_part]
+    for state, own_part in BLOCKS:
+        for other, other_part in BLOCKS:
+            rows_after = slice(6 + own_part.start, 6 + own_part.stop)
+            normal.below[ties.start : last, state, other] += product[inside, rows_after, other_part]
 
 
 def _padded(model: Model, own: slice, ties: slice) -> np.ndarray:
@@ -359,16 +381,19 @@ def sums_by_interval(model: Model, x: Array, own: slice, ties: slice) -> Array:
     return np.asarray(sums)
 
 
-def layout_of(model: Model, *, dip: bool, lever_arm: bool) -> tuple[dict[str, slice], int]:
-    """Where each free parameter stands in θ, and how many there are."""
+def layout_of(
+    model: Model, values: Mapping[str, Array], *, dip: bool, lever_arm: bool
+) -> tuple[dict[str, slice], int]:
+    """Where each free parameter stands in θ, and how many there are: optional terms where `values` has them."""
     layout, at = {}, 0
     free = ["gyroscope", *model.rows]
     if dip and len(model.rows) == 2:
         free.append("dip")
     if lever_arm and "accelerometer" in model.rows:
         free.append("lever_arm")
+    free += [name for name in OPTIONAL if name in values]
     for name in free:
-        size = {"dip": 1, "lever_arm": 3}.get(name, 6)
+        size = {"dip": 1, "lever_arm": 3, **OPTIONAL}.get(name, 6)
         layout[name] = slice(at, at + size)
         at += size
     return layout, at

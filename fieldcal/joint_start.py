@@ -13,21 +13,15 @@ from fieldcal.gyro_equation import fit_equation_error
 from fieldcal.gyro_output import propagate_stretches
 from fieldcal.joint_chain import STATES, place_knots
 from fieldcal.joint_model import Model, Readings, State, averaging_side, stretches
-from fieldcal.rotation import (
-    Array,
-    body_from_inertial,
-    conjugate,
-    continuous,
-    from_rotation_vector,
-    multiply,
-    normalise,
-)
+from fieldcal.rotation import Array, angle_between, body_from_inertial, continuous, from_rotation_vector, multiply
 from fieldcal.smoothing import differentiate_samples, smooth_samples
 
 SPACING_S = 0.08
 START_CUTOFF_HZ = 4.0
-FOLLOW_HZ, FOLLOW_SIDE_S = 0.2, 1.5
-TRUST = np.array([0.1, 0.03])  # relative length of field and gravity off by this: half the weight
+# Low-passes (cut-off, Hz; reach on either side, s) of the vectors that the gyroscope carries: the longer, the less of
+# translation and passing magnets is left, and the more of what the gyroscope drifts.
+WINDOWS = ((0.2, 1.5), (0.07, 4.5), (0.02, 15.0))
+TRUST = 0.1  # relative; a field that far off its own mean has half the weight
 # Rates for the lever arm: their derivative's noise would shrink it (a regressor), so no more than the motion needs.
 LEVER_ARM_CUTOFF_HZ, LEVER_ARM_SIDE_S = 1.5, 1.0
 
@@ -107,50 +101,60 @@ def _start_attitude(
     for name, own in vectors.items():
         logged = r.accelerometer if name == "accelerometer" else r.magnetometer
         if own is not None and logged is not None:
-            complete = _filled(r.t, logged)
-            sensed[name] = low_passed(r.t, r.segment, complete, START_CUTOFF_HZ, 0.5) * own[0] + own[1]
-    down = np.array([0.0, 0.0, float(np.sign(r.gravity_mps2))])
-    if len(sensed) == 2:
-        both = np.stack([sensed["magnetometer"], sensed["accelerometer"]], axis=1)
-        heading = float(np.arctan2(r.field_ned[1], r.field_ned[0]))
-        reference = np.array([r.field_ned, down])
-        q = continuous(wahba.attitudes(both, reference, np.array([0.02, 0.02]), declination=heading).q)
-        gyro = gyro if gyro is not None else _gyro_from_attitude(r, q)
-        lengths = np.linalg.norm(both, axis=2) / [np.linalg.norm(r.field_ned), abs(r.gravity_mps2)] - 1.0
-        trust = 1.0 / (1.0 + np.sum((lengths / TRUST) ** 2, axis=1))
-        return _carried_by_gyroscope(r, q, gyro, trust), gyro
+            sensed[name] = _filled(r.t, logged) * own[0] + own[1]
+    if len(sensed) == 2 and gyro is None:
+        both = {name: low_passed(r.t, r.segment, own, START_CUTOFF_HZ, 0.5) for name, own in sensed.items()}
+        gyro = _gyro_from_attitude(r, continuous(_turned_to(r, both)))
     if not sensed or gyro is None:
         raise UnusableFlight(
             "no_start",
             "The joint estimate found no start: it needs a magnetometer or accelerometer with some constants, and with"
             " one of them alone a gyroscope whose unit is known.",
         )
-    ((name, vector),) = sensed.items()
     relative = propagate_stretches(r.t, r.gyroscope * gyro[0] + gyro[1], r.segment)
-    return _levelled(relative, vector, r.field_ned if name == "magnetometer" else down), gyro
+    r_nb = body_from_inertial(relative).transpose(0, 2, 1)
+    carried = {name: np.einsum("nij,nj->ni", r_nb, own) for name, own in sensed.items()}
+    offsets = [_turned_to(r, _means(r, carried, *window)) for window in WINDOWS]
+    wander = [_wander(r.t, offset, side_s) for offset, (_, side_s) in zip(offsets, WINDOWS, strict=True)]
+    return multiply(offsets[int(np.argmin(wander))], relative), gyro
 
 
-def _carried_by_gyroscope(r: Readings, q: Array, gyro: Constants, trust: Array) -> Array:
-    """Attitudes that turn as the gyroscope says and follow `q` (n, 4), weighted by `trust` (n,), over seconds: sudden
-    errors of the vectors stay out."""
-    relative = propagate_stretches(r.t, r.gyroscope * gyro[0] + gyro[1], r.segment)
-    offset = multiply(q, conjugate(relative))
-    for a, b in stretches(r.segment):
-        offset[a:b] = continuous(offset[a:b])
-    weighted = low_passed(r.t, r.segment, offset * trust[:, None], FOLLOW_HZ, FOLLOW_SIDE_S)
-    return multiply(normalise(weighted), relative)
+def _means(r: Readings, carried: Mapping[str, Array], cutoff_hz: float, side_s: float) -> dict[str, Array]:
+    """Vectors in the axes that the gyroscope carries, low-passed. Translation averages out; a magnet does not, so that
+    a field far off its mean counts less."""
+    out = {name: low_passed(r.t, r.segment, x, cutoff_hz, side_s) for name, x in carried.items()}
+    if "magnetometer" in carried:
+        field, mean = carried["magnetometer"], out["magnetometer"]
+        limit = TRUST * np.linalg.norm(r.field_ned)
+        trust = 1.0 / (1.0 + np.sum(((field - mean) / limit) ** 2, axis=1, keepdims=True))
+        weighted = low_passed(r.t, r.segment, np.hstack([field * trust, trust]), cutoff_hz, side_s)
+        out["magnetometer"] = weighted[:, :3] / np.maximum(weighted[:, 3:], 1e-3)
+    return out
 
 
-def _levelled(relative: Array, vector: Array, reference: Array) -> Array:
-    """Integrated attitudes turned, sample by sample and the shortest way, so that `vector` (n, 3) lies along the
-    inertial `reference` (3,)."""
-    inertial = np.einsum("nji,nj->ni", body_from_inertial(relative), vector)
-    inertial /= np.linalg.norm(inertial, axis=1, keepdims=True)
-    unit = reference / np.linalg.norm(reference)
-    axis = np.cross(inertial, unit)
+def _turned_to(r: Readings, vectors: Mapping[str, Array]) -> Array:
+    """Attitudes (n, 4) of axes in which `vectors` (n, 3) are seen; with one of them the shortest turn."""
+    down = np.array([0.0, 0.0, float(np.sign(r.gravity_mps2))])
+    if len(vectors) == 2:
+        both = np.stack([vectors["magnetometer"], vectors["accelerometer"]], axis=1)
+        heading = float(np.arctan2(r.field_ned[1], r.field_ned[0]))
+        reference = np.array([r.field_ned, down])
+        return wahba.attitudes(both, reference, np.array([0.02, 0.02]), declination=heading).q
+    ((name, vector),) = vectors.items()
+    seen = vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)
+    true = r.field_ned / np.linalg.norm(r.field_ned) if name == "magnetometer" else down
+    axis = np.cross(seen, true)
     sine = np.linalg.norm(axis, axis=1)
-    angle = np.arctan2(sine, inertial @ unit)
-    return multiply(from_rotation_vector(axis * (angle / np.maximum(sine, 1e-12))[:, None]), relative)
+    angle = np.arctan2(sine, seen @ true)
+    return from_rotation_vector(axis * (angle / np.maximum(sine, 1e-12))[:, None])
+
+
+def _wander(t: Array, offset: Array, side_s: float) -> float:
+    """Rms angle, rad, between means that share no reading: what disturbs them and what the gyroscope drifts by."""
+    apart = int(2.0 * side_s / float(np.median(np.diff(t))))
+    if apart >= len(t):
+        return np.inf
+    return float(np.sqrt(np.mean(angle_between(offset[:-apart], offset[apart:]) ** 2)))
 
 
 def _filled(t: Array, x: Array) -> Array:

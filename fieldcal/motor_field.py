@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy.special import fdtrc
 
 from fieldcal.rotation import Array
 from fieldcal.sensor_sanity import Fault
@@ -123,7 +123,7 @@ def motor_field(field: ArrayLike, drive: ArrayLike, strength: float) -> MotorFie
         share_sd=float(np.linalg.norm(part * sd)) / share if share > 0.0 else 0.0,
         correlation=_correlation(residual, jacobian, k),
         independent=independent,
-        p_value=float(stats.f.sf(wald, 3, max(independent - len(theta), 1.0))),
+        p_value=float(fdtrc(3.0, max(independent - len(theta), 1.0), wald)),
     )
 
 

@@ -47,6 +47,7 @@ SMOOTHING = ("smoothing_cutoff_hz", "smoothing_ends", "smoothing_side_s")
 VECTORS = ("attitude", "field_ned", "gravity_mps2", "gravity_sign", "nominal_scale", "polarity", "units", *AXES)
 GYRO = ("gyro_max_scale_sd", "nominal_scale", "polarity", "units", "reference_reading", *AXES)
 EQUATION = ("equations", "differentiation_window_s", "smoothing_cutoff_hz", "smoothing_side_s")
+VPS = ("world", "vps_max_lag_s", "vps_min_peak", "vps_max_gap_s")
 FAULTS = {"faults": "sanity.faults"}
 SAMPLES = {"samples": "smoothing.samples", "temperature": "ingest.temperature", **FAULTS}
 MAGNETOMETER = {"magnetometer": "magnetometer.calibration", "magnetometer_covariance": "magnetometer.covariance"}
@@ -214,6 +215,7 @@ PIPELINE: tuple[Stage, ...] = (
         {
             **SAMPLES,
             "imu": "ingest.imu",
+            "vps": "ingest.vps",
             "magnetometer_log": "ingest.magnetometer",
             "magnetometer": "magnetometer.calibration",
             "accelerometer": "accelerometer_pass2.calibration",
@@ -237,6 +239,8 @@ PIPELINE: tuple[Stage, ...] = (
             "ellipsoid_max_scale_sd",
             "ellipsoid_max_residual",
             "gyro_max_scale_sd",
+            "use_vps",
+            *VPS,
         ),
     ),
     Stage(
@@ -245,15 +249,17 @@ PIPELINE: tuple[Stage, ...] = (
         {
             "imu": "ingest.imu",
             "vps": "ingest.vps",
+            "magnetometer_log": "ingest.magnetometer",
             "attitude": "attitude_pass2.attitude",
             "gyroscope": "gyro_output.calibration",
             "joint": "joint.calibration",
             "joint_attitude": "joint.attitude",
+            "motor_faults": "vectors.faults",
             **FAULTS,
         },
         ("imu",),
         ("sync", "vps_aligned"),
-        (*AXES, "world", "polarity", "nominal_scale", "vps_max_lag_s", "vps_min_peak", "vps_max_gap_s"),
+        (*AXES, "polarity", "nominal_scale", *VPS),
         ("gyroscope",),
     ),
     Stage(

@@ -51,23 +51,37 @@ class UniformRates:
 
 @dataclass(frozen=True)
 class SyncFit:
-    """VPS clock + lag = IMU clock. `lag_s` at the first IMU sample, `lag_mid_s` at mid-record, `skew_ppm` > 0: VPS
-    clock fast.
+    """VPS clock + lag = IMU clock: `lag_mid_s` at mid-record, IMU time `reference_s`; `skew_ppm` > 0: VPS clock fast;
+    `covariance` (2, 2) of the lag at mid-record, s, and the skew (a ratio); `first_s` the first IMU sample.
 
     `explained` is the share of the rates' variance that the VPS accounts for; `peak` and `runner_up` are
     correlations (the second: best one outside the peak); `matrix` (3, 3) maps VPS body rates to logged rates."""
 
-    lag_s: float
     lag_mid_s: float
-    lag_sd_s: float
     skew_ppm: float
-    skew_sd_ppm: float
+    covariance: Array
     peak: float
     runner_up: float
     peak_width_s: float
     explained: float
     matrix: Array
     reference_s: float
+    first_s: float
+
+    @property
+    def lag_s(self) -> float:
+        """Lag at the first IMU sample, s."""
+        return self.lag_mid_s + 1e-6 * self.skew_ppm * (self.reference_s - self.first_s)
+
+    @property
+    def lag_sd_s(self) -> float:
+        """Standard deviation of the lag at mid-record, s."""
+        return float(np.sqrt(self.covariance[0, 0]))
+
+    @property
+    def skew_sd_ppm(self) -> float:
+        """Standard deviation of the skew, ppm."""
+        return float(1e6 * np.sqrt(self.covariance[1, 1]))
 
     def to_imu_clock(self, t_vps: ArrayLike) -> Array:
         """VPS stamps, s, on the IMU clock."""
@@ -97,6 +111,10 @@ def mask_outliers(t: ArrayLike, q: ArrayLike, *, max_rate: float = 40.0) -> np.n
         bad[1:-1] |= fast[:-1] & fast[1:]
         # Of neighbouring suspects only the worst goes at a time: a single outlier also spoils the two beside it.
         score = np.r_[0.0, middle, 0.0]
+        # The first and last are seen only by their neighbours: one that is off while the next but one is not.
+        for end, beside, beyond in ((0, 1, 2), (-1, -2, -3)):
+            if bad[beside] and not bad[beyond]:
+                bad[end], bad[beside], score[end] = True, False, np.inf
         worst = bad & (score >= np.r_[0.0, score[:-1]]) & (score >= np.r_[score[1:], 0.0])
         if not worst.any():
             break
@@ -296,19 +314,17 @@ def _refine(
     explained = 1.0 - float(weight @ np.sum(residual**2, axis=1)) / float(weight @ np.sum(spread**2, axis=1))
     # Both sides are filtered: the residual's colour sets the sd.
     _, covariance = least_squares_covariance(sensitivity, residual * root[:, None])
-    at_first = np.array([1.0, middle - first])  # lag(t) = lag_mid − skew (t − middle)
     return SyncFit(
-        lag_s=lag + skew * (middle - first),
         lag_mid_s=lag,
-        lag_sd_s=float(np.sqrt(at_first @ covariance @ at_first)),
         skew_ppm=1e6 * skew,
-        skew_sd_ppm=float(1e6 * np.sqrt(covariance[1, 1])),
+        covariance=covariance,
         explained=explained,
         peak=measured["peak"],
         runner_up=measured["runner_up"],
         peak_width_s=measured["peak_width_s"],
         matrix=matrix,
         reference_s=middle,
+        first_s=first,
     )
 
 

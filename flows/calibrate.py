@@ -84,7 +84,7 @@ def run_log(
             tables |= {f"{stage.name}.{name}": frame for name, frame in result.tables.items()}
     facts = judged(facts, records)
     leading = lead(job, vehicle.imu_id, facts)
-    published = published_tables(leading, {name: (frame, None) for name, frame in tables.items()})
+    published = published_tables([(leading, {name: (frame, None) for name, frame in tables.items()})])
     sync = rows_of(published["sync"])
     document = {
         "flight": unfolded(rows_of(rows_frame("flight", [flight_row(job, leading, facts)]))[0]),

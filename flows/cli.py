@@ -339,13 +339,15 @@ def _night(
 
             print_plan(console(), plan)
         return OK
-    from flows.present_night import NightProgress, print_night
+    from flows.progress import NightProgress
 
     with NightProgress() as progress:
         result = run_night(archive, root, config, folder, workers, progress, **where)
     if as_json:
         print_json(result)
     else:
+        from flows.present_night import print_night
+
         print_night(console(), result, root)
     return OK if result["ok"] == len(result["logs"]) else LOSSES
 

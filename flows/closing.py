@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from fieldcal.configuration import Alerts
-from fieldcal.provenance import source_digest
-from flows import drift, drift_curve, drift_reasons, drift_warm_up
 from flows.drift_changes import Change, changes, last_usable
+from flows.steps import code_digest
 from warehouse import Warehouse
 from warehouse.checksums import history_digest
 from warehouse.files import write_bytes
@@ -49,7 +48,9 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
         former = Warehouse(root).scan("drift").collect()
         made_from = _made_from(root)
         if before.get("made_from") != made_from or before.get("made") != history_digest(root, ["drift"]):
-            drift.update_drift(root)
+            from flows.drift import update_drift
+
+            update_drift(root)
         table = Warehouse(root).scan("drift").collect()
         # With other limits than last time, what they make old is told whenever it passed them.
         limits = asdict(alerts)
@@ -83,10 +84,9 @@ def _reports(root: Path, told: Sequence[Change]) -> Path:
 
 def _made_from(root: Path) -> str:
     """Digest of what trends are made from: the history and the code."""
-    digest = hashlib.sha256(history_digest(root, INPUTS).encode())
-    digest.update(source_digest(drift.update_drift).encode())
-    for module in (drift, drift_curve, drift_reasons, drift_warm_up):
-        digest.update(Path(str(module.__file__)).read_bytes())
+    digest = hashlib.sha256(f"{history_digest(root, INPUTS)}\0{code_digest()}".encode())
+    for path in sorted(Path(__file__).parent.glob("drift*.py")):
+        digest.update(path.read_bytes())
     return digest.hexdigest()
 
 

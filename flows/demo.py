@@ -12,7 +12,8 @@ import polars as pl
 from fieldcal.simulate import SENSORS, Experiment
 from fieldcal.simulate_logs import write_flights
 from flows.night import run_night
-from flows.present_night import NightProgress, print_night
+from flows.present_night import print_night
+from flows.progress import NightProgress
 from flows.show import console, number, say, table, with_sd
 from warehouse import Warehouse
 
@@ -21,7 +22,7 @@ BEST_METHODS = {"magnetometer": "ellipsoid_robust", "accelerometer": "ellipsoid_
 QUESTIONS = (
     "SELECT vehicle_id, sensor, axis, value_at_25degc, sd FROM latest_calibration WHERE parameter = 'scale'",
     "SELECT log_uri, quantity, method, reference, tic, rms, rms_unit FROM worst_tic LIMIT 10",
-    "SELECT vehicle_id, lag_s, lag_sd_s, skew_ppm FROM sync",
+    "SELECT vehicle_id, lag_mid_s, lag_sd_s, skew_ppm FROM sync",
 )
 
 

@@ -12,7 +12,7 @@ from fieldcal import drift, few_sessions, fleet
 from fieldcal.histories import ENOUGH_SESSIONS, Histories
 from flows.ask import existing
 from flows.drift_curve import Bends, Bent, bends_of, bent
-from flows.drift_reasons import reason
+from flows.drift_reasons import AGREEMENT, VPS, reason
 from flows.drift_warm_up import known_slopes
 from schemas import TABLES
 from warehouse import Warehouse
@@ -24,8 +24,6 @@ KEY = ["imu_id", "sensor", "method", "parameter", "axis"]
 SIBLINGS = ("sensor", "method", "parameter", "axis", "unit")
 SIGNED = ("scale", "bias", "zero_bias")
 """Parameters whose sign follows the polarity of the axis: siblings may be mounted the other way round."""
-VPS, AGREEMENT = "vps", "fit"
-"""What stands as `sensor` of rows about the VPS clock and about agreement (Theil's coefficients)."""
 NO_BENDS: Bends = {}
 DAY_US = 86_400_000_000
 ATTEMPTS = 10

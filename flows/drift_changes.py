@@ -11,8 +11,7 @@ from typing import Any
 import polars as pl
 
 from fieldcal.configuration import Alerts
-from flows.drift import AGREEMENT
-from flows.drift_reasons import UNCONFIRMED_SIGMAS
+from flows.drift_reasons import AGREEMENT, UNCONFIRMED_SIGMAS
 from warehouse import Warehouse
 
 NORMAL = Alerts()

@@ -8,6 +8,8 @@ from typing import Any
 from fieldcal.histories import ENOUGH_SESSIONS
 from flows.show import number, with_sd
 
+VPS, AGREEMENT = "vps", "fit"
+"""What stands as `sensor` of rows about the VPS clock and about agreement (Theil's coefficients)."""
 UNCONFIRMED_SIGMAS = 5.0
 """Distance of the last flight from the line beyond which it may be the first after a step."""
 

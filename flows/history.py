@@ -11,7 +11,7 @@ import polars as pl
 from fieldcal.configuration import Configuration
 from fieldcal.pipeline import PUBLISHED
 from flows.jobs import Job
-from flows.rows import flight_row, judged, lead, published_tables, rows_frame, run_rows
+from flows.rows import StageTables, flight_row, judged, lead, published_tables, rows_frame, run_rows
 from flows.steps import INGEST, Record
 from warehouse.publish import publish, read_history
 from warehouse.stage_store import StageStore
@@ -27,19 +27,20 @@ def publish_vehicle(
     """
     imu_id = configuration.vehicle(vehicle_id).imu_id
     former = read_history(root, "flight", vehicle_id)
-    fresh = {job.flight_id: _rows(job, imu_id, records) for job, records in flights}
+    fresh = _rows(flights, imu_id)
     stale = _differing(root, vehicle_id, former, fresh, {job.flight_id: records for job, records in flights})
-    places = {job.log_uri for job, _ in flights}
-    gone = former.filter(pl.col("log_uri").is_in(list(places)) & ~pl.col("flight_id").is_in(list(fresh)))
+    places, ids = {job.log_uri for job, _ in flights}, [job.flight_id for job, _ in flights]
+    gone = former.filter(pl.col("log_uri").is_in(list(places)) & ~pl.col("flight_id").is_in(ids))
     leaving = set(gone["flight_id"].to_list())
     if not stale and not leaving:
         return ()
-    rows: dict[str, list[pl.DataFrame]] = {}
-    for job, records in flights:
-        if job.flight_id in stale:
-            for table, frame in _tables(root, job, imu_id, records, fresh[job.flight_id]).items():
-                rows.setdefault(table, []).append(frame)
-    return publish(root, vehicle_id, {t: pl.concat(parts) for t, parts in rows.items()}, stale | leaving)
+    own = {table: frame.filter(pl.col("flight_id").is_in(list(stale))) for table, frame in fresh.items()}
+    made = [
+        (lead(job, imu_id, records[INGEST]["facts"]), _tables(root, job, records))
+        for job, records in flights
+        if job.flight_id in stale
+    ]
+    return publish(root, vehicle_id, {**own, **published_tables(made)} if stale else {}, stale | leaving)
 
 
 def withdraw(root: Path, vehicle_id: str, flights: set[str]) -> None:
@@ -47,35 +48,36 @@ def withdraw(root: Path, vehicle_id: str, flights: set[str]) -> None:
     publish(root, vehicle_id, {}, flights)
 
 
-def _rows(job: Job, imu_id: str, records: Mapping[str, Record]) -> dict[str, pl.DataFrame]:
-    facts = judged(records[INGEST]["facts"], records)
-    leading = lead(job, imu_id, facts)
-    return {
-        "flight": rows_frame("flight", [flight_row(job, leading, facts)]),
-        "run": rows_frame("run", run_rows(leading, records)),
-    }
+def _rows(flights: Sequence[tuple[Job, Mapping[str, Record]]], imu_id: str) -> dict[str, pl.DataFrame]:
+    """`flight` and `run` as they should be."""
+    rows: dict[str, list[dict[str, Any]]] = {"flight": [], "run": []}
+    for job, records in flights:
+        facts = judged(records[INGEST]["facts"], records)
+        leading = lead(job, imu_id, facts)
+        rows["flight"].append(flight_row(job, leading, facts))
+        rows["run"] += run_rows(leading, records)
+    return {table: rows_frame(table, own) for table, own in rows.items()}
 
 
 def _differing(
     root: Path,
     vehicle_id: str,
     former: pl.DataFrame,
-    fresh: Mapping[str, Mapping[str, pl.DataFrame]],
+    fresh: Mapping[str, pl.DataFrame],
     records: Mapping[str, Mapping[str, Record]],
 ) -> set[str]:
     """Flights whose rows in `flight` and `run`, or whose numbers of rows elsewhere, are not what they should be."""
     there = {"flight": former, "run": read_history(root, "run", vehicle_id)}
     stale = set()
     for table, held in there.items():
-        new = pl.concat([tables[table] for tables in fresh.values()]) if fresh else held.clear()
-        both = _counted(new, held, list(new.columns))
+        both = _counted(fresh[table], held, list(held.columns))
         stale |= set(both.filter(pl.col("new") != pl.col("held"))["flight_id"].to_list())
     for table, sources in PUBLISHED.items():
         wanted = {flight_id: _row_count(own, sources) for flight_id, own in records.items()}
         held = read_history(root, table, vehicle_id)
         counts = dict(held.group_by("flight_id").len().iter_rows())
         stale |= {flight_id for flight_id, count in wanted.items() if counts.get(flight_id, 0) != count}
-    return stale & set(fresh)
+    return stale & set(records)
 
 
 def _counted(new: pl.DataFrame, held: pl.DataFrame, columns: list[str]) -> pl.DataFrame:
@@ -92,16 +94,13 @@ def _row_count(records: Mapping[str, Record], sources: Sequence[str]) -> int:
     )
 
 
-def _tables(
-    root: Path, job: Job, imu_id: str, records: Mapping[str, Record], known: Mapping[str, pl.DataFrame]
-) -> dict[str, pl.DataFrame]:
-    """All history rows of one flight."""
+def _tables(root: Path, job: Job, records: Mapping[str, Record]) -> StageTables:
+    """What the stages made of one flight for the history."""
     store = StageStore(root)
-    tables: dict[str, Any] = {}
+    tables = {}
     for source in (name for sources in PUBLISHED.values() for name in sources):
         step, table = source.split(".")
         if step in records and table in records[step]["outputs"]:
             run_key = records[step]["run_key"]
             tables[source] = (store.load(step, job.flight_id, run_key, [table])[table], run_key)
-    leading = lead(job, imu_id, records[INGEST]["facts"])
-    return {**published_tables(leading, tables), **known}
+    return tables

@@ -33,19 +33,21 @@ def run_night(
     find_source(config, archive)
     prepare(root)
     named = str(config) if config else None
+    runner, scheduler = where.get("runner") or "process", where.get("scheduler")
     with running_server(root) as server:
         starting = time.monotonic()
         from flows.housekeeping import tidy_prefect
-        from flows.nightly import plan_ahead, run_nightly
+        from flows.nightly import prepared, run_nightly
+        from flows.runners import Parallel
 
         imported = time.monotonic()
-        plan_ahead(archive, root, named, session)
-        waiting = time.monotonic()
-        url = server.wait()
-        start_s = imported - starting + time.monotonic() - waiting
-        tidy_prefect(root, url, own_server=server.own)
-        what = {"archive": str(archive)} if session is None else {"folder": str(session)}
-        result = run_nightly(url, progress, **what, warehouse=str(root), config=named, workers=workers, **where)
+        with prepared(archive, root, named, session, Parallel(workers, runner, scheduler)):
+            waiting = time.monotonic()
+            url = server.wait()
+            start_s = imported - starting + time.monotonic() - waiting
+            tidy_prefect(root, url, own_server=server.own)
+            what = {"archive": str(archive)} if session is None else {"folder": str(session)}
+            result = run_nightly(url, progress, **what, warehouse=str(root), config=named, workers=workers, **where)
     logs = result.pop("logs")
     times = {"seconds": round(time.monotonic() - began, 3), "server_seconds": round(start_s, 3)}
     return {**result, **times, "logs": logs}

@@ -10,15 +10,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import cloudpickle
 import polars as pl
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import State, StateDetails
+from prefect.context import hydrated_context
 from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.states import Completed
 
@@ -28,12 +31,12 @@ from flows.artifact import keep_artifact
 from flows.closing import close_night, tell_prefect
 from flows.flights import flights, lost, one_step
 from flows.history import publish_vehicle, withdraw
-from flows.jobs import Source, configuration_of, find_source
+from flows.jobs import Job, Source, configuration_of, find_source
 from flows.log_ledger import write_ledger
 from flows.outcome import Outcome, summary
 from flows.plan import Plan, make_plan
-from flows.pool import hand_over
-from flows.runners import Parallel, answers, batches
+from flows.pool import hand_over, pool_answers
+from flows.runners import Answers, Parallel, batches, dask_answers, process_answers, processes_begun
 from flows.show import say
 from flows.source_ledger import know_sources
 from flows.steps import FlightWork, Record, code_digest
@@ -76,6 +79,16 @@ def run_step(flight_id: str, step: str, log_uri: str) -> State[Any]:
 def run_batch(number: int, root: str, source: Source, jobs: list[dict[str, Any]], code: str) -> dict[str, Any]:
     """A batch of flights, every step a task (`flows.flights.flights`)."""
     return flights(root, source, jobs, code, _as_task, tell_done)
+
+
+def _batch_in_process(context: bytes, given: dict[str, Any]) -> dict[str, Any]:
+    """A batch in another process of this machine, within the night's flow run."""
+    with hydrated_context(cloudpickle.loads(context)):
+        return run_batch(**given)
+
+
+def _ready() -> None:
+    """What a process does that has only to be there."""
 
 
 @flow(name="batch", persist_result=False, validate_parameters=False)
@@ -153,9 +166,20 @@ def run_nightly(api_url: str, watcher: Watcher | None = None, **parameters: Any)
     return result
 
 
-def plan_ahead(root_of_logs: Path, root: Path, config: str | None, only: Path | None) -> None:
-    """Plan the night that this process is about to run, while its server starts; the flow takes the plan from here."""
-    _planned[(root_of_logs, root, config, only)] = _plan(root_of_logs, root, config, only)
+@contextmanager
+def prepared(
+    root_of_logs: Path, root: Path, config: str | None, only: Path | None, parallel: Parallel
+) -> Iterator[None]:
+    """Plan the night that this process is about to run, and start its processes, while the server starts.
+
+    The flow takes both from here.
+    """
+    source, settings, plan = _plan(root_of_logs, root, config, only)
+    _planned[(root_of_logs, root, config, only)] = source, settings, plan
+    n_batches = len(batches(_missing(plan), parallel.workers))
+    spawned = parallel.runner == "process" and not parallel.in_this_process(n_batches)
+    with processes_begun(parallel.workers, _ready) if spawned else nullcontext():
+        yield
 
 
 def _plan(root_of_logs: Path, root: Path, config: str | None, only: Path | None) -> tuple[Source, Configuration, Plan]:
@@ -212,23 +236,34 @@ def _from_cache(plan: Plan) -> Iterator[Outcome]:
 
 def _calibrate(root: Path, plan: Plan, source: Source, parallel: Parallel) -> Iterator[Outcome]:
     """Outcomes of the flights with something missing, batch by batch."""
-    missing = [job for job in plan.jobs if job.flight_id in plan.missing]
     code = code_digest()
     inputs: list[dict[str, Any]] = [
         {"number": n, "root": str(root), "source": source, "jobs": [job.plain() for job in jobs], "code": code}
-        for n, jobs in enumerate(batches(missing, parallel.workers))
+        for n, jobs in enumerate(batches(_missing(plan), parallel.workers))
     ]
     if parallel.in_this_process(len(inputs)):
         for given in inputs:
             yield from _outcomes(run_batch(**given))
         return
-    for given, answer in answers(parallel, run_batch, inputs):
+    for given, answer in _answers(parallel, inputs):
         if isinstance(answer, Exception):
             say(f"Batch {given['number']} was lost ({type(answer).__name__}: {answer}); its logs follow one by one.")
             answer = _one_by_one(given)
         for outcome in _outcomes(answer):
             tell_done(outcome)
             yield outcome
+
+
+def _answers(parallel: Parallel, inputs: list[dict[str, Any]]) -> Answers:
+    if parallel.runner == "pool":
+        return pool_answers(inputs)
+    if parallel.runner == "dask":
+        return dask_answers(parallel, run_batch, inputs)
+    return process_answers(parallel.workers, _batch_in_process, inputs)
+
+
+def _missing(plan: Plan) -> list[Job]:
+    return [job for job in plan.jobs if job.flight_id in plan.missing]
 
 
 def _outcomes(answer: dict[str, Any]) -> Iterator[Outcome]:

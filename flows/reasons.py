@@ -12,18 +12,16 @@ NO_RESULT = "no result yet"
 LONGEST_VALUE = 40
 
 
-def why_it_runs(former: Mapping[str, Any] | None, now: Mapping[str, Any]) -> str:
+def why_it_runs(former: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """A sentence without its full stop: "smoothing_cutoff_hz 8.0 → 6.0", "new input: attitude.attitude", …
 
     Parameters
     ----------
-    former : mapping or None
-        Record of the step's last result; None when there is none.
+    former : mapping
+        Record of the step's last result.
     now : mapping
         `run_key`, `params`, `inputs`, `source` and `versions` as they are now.
     """
-    if former is None:
-        return NO_RESULT
     if former["run_key"] == now["run_key"]:
         return "its result is incomplete or was changed on disk"
     return "; ".join(_differences(former, now)) or "its last result was made otherwise"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import polars as pl
 
 import schemas
@@ -27,7 +28,18 @@ FACTS = (
     "reason",
     "verifiable",
 )
-LEAD = ("flight_id", "vehicle_id", "imu_id", "session_id", "started_at")
+LEAD_SCHEMA = pl.Schema(
+    {
+        "flight_id": pl.String(),
+        "vehicle_id": pl.String(),
+        "imu_id": pl.String(),
+        "session_id": pl.String(),
+        "started_at": pl.Datetime("us", "UTC"),
+        "run_key": pl.String(),
+    }
+)
+StageTables = Mapping[str, tuple[pl.DataFrame, str | None]]
+"""`stage.table` → its rows and the run_key that made them."""
 
 
 def lead(job: Job, imu_id: str, facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -89,24 +101,23 @@ def refusals(records: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def published_tables(
-    leading: Mapping[str, Any], tables: Mapping[str, tuple[pl.DataFrame, str | None]]
-) -> dict[str, pl.DataFrame]:
-    """`calibration`, `fit` and `sync` of one flight from `stage.table` → (frame, run_key)."""
+def published_tables(flights: Sequence[tuple[Mapping[str, Any], StageTables]]) -> dict[str, pl.DataFrame]:
+    """`calibration`, `fit` and `sync` of flights, each its `lead` and its stages' tables."""
     result = {}
     for table, sources in PUBLISHED.items():
         parts = [
-            frame.with_columns(
-                *(pl.lit(value).alias(name) for name, value in leading.items() if name != "started_at"),
-                pl.lit(leading["started_at"], dtype=pl.Datetime("us", "UTC")).alias("started_at"),
-                pl.lit(run_key, dtype=pl.String).alias("run_key"),
-            )
+            ({**leading, "run_key": run_key}, frame)
+            for leading, tables in flights
             for frame, run_key in (tables[name] for name in sources if name in tables)
         ]
+        if not parts:
+            result[table] = empty_frame(table)
+            continue
+        leads = pl.DataFrame([leading for leading, _ in parts], schema=LEAD_SCHEMA)
         columns = [column.name for column in schemas.table_columns(table)]
-        result[table] = (
-            pl.concat([part.select(columns) for part in parts], how="vertical") if parts else empty_frame(table)
-        )
+        own = pl.concat([frame.select([name for name in columns if name not in LEAD_SCHEMA]) for _, frame in parts])
+        of_row = np.repeat(np.arange(len(parts)), [frame.height for _, frame in parts])
+        result[table] = pl.concat([leads[of_row], own], how="horizontal").select(columns)
     return result
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from multiprocessing import get_context
 from typing import TYPE_CHECKING, Any
 
 from fieldcal.errors import FieldcalError
@@ -15,8 +18,9 @@ if TYPE_CHECKING:
 
 RUNNERS = ("process", "dask", "pool")
 LARGEST_BATCH = 40
-SMALLEST_BATCH = 4
+SMALLEST_BATCH = 2
 SHARE_OF_A_WORKER = 4
+LISTEN_S = 0.25
 
 
 @dataclass(frozen=True)
@@ -25,11 +29,20 @@ class Parallel:
 
     "pool": the deployment `batch/fieldcal` of `prefect.yaml`, whose work pool has workers on machines that see the same
     archive and warehouse.
+
+    Raises
+    ------
+    FieldcalError
+        `wrong_option`.
     """
 
     workers: int = 1
     runner: str = "process"
     scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.runner not in RUNNERS:
+            raise FieldcalError("wrong_option", f"runner must be one of {', '.join(RUNNERS)}, not {self.runner!r}.")
 
     def in_this_process(self, n_batches: int) -> bool:
         """Whether other processes would only cost."""
@@ -49,41 +62,67 @@ def batches(jobs: Sequence[Job], workers: int) -> list[list[Job]]:
     return dealt
 
 
-def answers(
-    parallel: Parallel, task: Task[Any, dict[str, Any]], inputs: Sequence[dict[str, Any]]
-) -> Iterator[tuple[dict[str, Any], dict[str, Any] | Exception]]:
-    """Run `task` on every input, elsewhere; each input with what came back, in the order in which they end.
+Answers = Iterator[tuple[dict[str, Any], dict[str, Any] | Exception]]
+"""Each input with what came back, in the order in which they end."""
+
+_begun: list[ProcessPoolExecutor] = []
+
+
+@contextmanager
+def processes_begun(workers: int, ready: Callable[[], None]) -> Iterator[None]:
+    """Within the block processes start and, to find `ready`, import its module; `process_answers` takes them."""
+    with _processes(workers) as pool:
+        for _ in range(workers):
+            pool.submit(ready)
+        _begun.append(pool)
+        try:
+            yield
+        finally:
+            _begun.clear()
+
+
+def process_answers(workers: int, run: Callable[..., dict[str, Any]], inputs: Sequence[dict[str, Any]]) -> Answers:
+    """Run `run(context, input)` in processes of this machine; `context` is Prefect's, of the flow run, pickled."""
+    import cloudpickle
+    from prefect.context import serialize_context
+
+    context = cloudpickle.dumps(serialize_context())
+    with nullcontext(_begun.pop()) if _begun else _processes(workers) as pool:
+        waiting: dict[Future[dict[str, Any]], dict[str, Any]] = {}
+        waiting |= {pool.submit(run, context, given): given for given in inputs}
+        while waiting:
+            # A wait without end would not hear Ctrl-C.
+            for future in wait(waiting, LISTEN_S, FIRST_COMPLETED).done:
+                yield waiting.pop(future), _answer(future)
+        pool.shutdown(wait=False)  # they tell Prefect the rest while the night publishes
+
+
+def _processes(workers: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+
+
+def dask_answers(parallel: Parallel, task: Task[Any, dict[str, Any]], inputs: Sequence[dict[str, Any]]) -> Answers:
+    """Run `task` on a Dask cluster: the one of the scheduler, or one of this machine.
 
     Raises
     ------
     FieldcalError
-        `wrong_option`, or there is nothing to run on (`no_dask`, `no_scheduler`, `no_deployment`).
+        `no_dask`, `no_scheduler`.
     """
-    if parallel.runner == "pool":
-        from flows.pool import pool_answers
-
-        yield from pool_answers(inputs)
-        return
     from prefect.futures import as_completed
 
-    with _task_runner(parallel) as runner:
+    with _dask(parallel) as runner:
         waiting = {runner.submit(task, given): given for given in inputs}
         for future in as_completed(list(waiting)):
-            try:
-                answer: dict[str, Any] | Exception = future.result()
-            except Exception as error:
-                answer = error
-            yield waiting[future], answer
+            yield waiting[future], _answer(future)
 
 
-def _task_runner(parallel: Parallel) -> TaskRunner[Any]:
-    if parallel.runner == "process":
-        from prefect.task_runners import ProcessPoolTaskRunner
-
-        return ProcessPoolTaskRunner(max_workers=parallel.workers)
-    if parallel.runner == "dask":
-        return _dask(parallel)
-    raise FieldcalError("wrong_option", f"runner must be one of {', '.join(RUNNERS)}, not {parallel.runner!r}.")
+def _answer(future: Any) -> dict[str, Any] | Exception:
+    try:
+        answer: dict[str, Any] = future.result()
+    except Exception as error:
+        return error
+    return answer
 
 
 def _dask(parallel: Parallel) -> TaskRunner[Any]:

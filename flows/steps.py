@@ -26,7 +26,7 @@ from fieldcal.provenance import PROJECT, run_key, source_digest
 from fieldcal.results import StageResult
 from fieldcal.tidy import Disordered
 from flows.jobs import Job, file_stamp
-from flows.reasons import why_it_runs
+from flows.reasons import NO_RESULT, why_it_runs
 from flows.versions import versions
 from warehouse.errors import WarehouseError
 from warehouse.files import file_sha256
@@ -113,7 +113,8 @@ class FlightWork:
         """The record of a step whose result is there and whole, taken as the step's; else None, and `why` says why."""
         record = self._store.complete(step, self.job.flight_id, self.key(step))
         if record is None or (step == INGEST and not self._signals_whole(record)):
-            self.why[step] = why_it_runs(self._store.latest(step, self.job.flight_id), self._causes(step))
+            former = self._store.latest(step, self.job.flight_id)
+            self.why[step] = NO_RESULT if former is None else why_it_runs(former, self._causes(step))
             return None
         self._take(step, record)
         return record

@@ -225,7 +225,6 @@ def test_settings_are_plain_json_and_leave_names_out() -> None:
         ("[vehicles.a.csv]\nseparator = ', '", "wrong_value", "single character"),
         ("[vehicles.a.csv]\nimu = { gyroscope = ['x','x','z'] }", "wrong_value", "one thing twice"),
         ("[vehicles.a.parameters]\nuse_vps = 1", "wrong_type", "true or false"),
-        ("[vehicles.a.parameters]\nuse_vps = true", "not_available", "leave it false"),
         ("[vehicles.a.parameters]\nsmoothing_cutoff_hz = 'fast'", "wrong_type", 'a number is needed here, not "fast"'),
         ("[vehicles.a.parameters]\nsmoothing_cutoff_hz = 501.0", "wrong_value", "from 0 to 500"),
         ("[vehicles.a.parameters]\nattitude = 'kalman'", "wrong_value", "quest, davenport"),

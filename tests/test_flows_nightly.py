@@ -292,10 +292,12 @@ def test_a_killed_night_ends_like_an_uninterrupted_one(
     assert verify(root)["ok"]
 
 
+@pytest.mark.parametrize("workers", [1, 2])
 def test_an_interrupt_ends_the_night_in_two_seconds(
-    simulated: Path, first_night: tuple[Path, Any], tmp_path: Path
+    simulated: Path, first_night: tuple[Path, Any], tmp_path: Path, workers: int
 ) -> None:
-    process = command("nightly", str(simulated), "--warehouse", str(tmp_path / "warehouse"))
+    where = ("--warehouse", str(tmp_path / "warehouse"), "--workers", str(workers))
+    process = command("nightly", str(simulated), *where)
     wait_for_stages(tmp_path / "warehouse", 2, process)
     began = time.monotonic()
     process.send_signal(signal.SIGINT)

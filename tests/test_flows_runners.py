@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -55,6 +57,37 @@ def test_a_dask_cluster_gives_the_same(archive: Path, content: str, tmp_path: Pa
     with cluster.get_client() as client:
         worked = client.run(lambda: "flows.nightly" in sys.modules)
     assert list(worked.values()) == [True, True]
+
+
+def test_every_step_in_two_processes_is_a_task_of_the_night(
+    archive: Path, content: str, tmp_path: Path, prefect_server: str
+) -> None:
+    before = set(tasks_of_runs(prefect_server))
+    run_night(archive, tmp_path, None, None, 2)
+    give_up = time.monotonic() + 20
+    while True:
+        (own,) = set(tasks_of_runs(prefect_server)) - before
+        tasks = tasks_of_runs(prefect_server)[own]
+        if tasks["run_step"] == 6 * len(STEPS) or time.monotonic() > give_up:
+            break
+        time.sleep(0.2)
+    assert tasks == {"run_step": 6 * len(STEPS), "run_batch": len(batches([job(0)] * 6, 2)), "run_publish": 2}
+
+
+def tasks_of_runs(url: str) -> dict[str, Counter[str]]:
+    """How many completed tasks of each kind the server knows, by flow run."""
+    from prefect.client.orchestration import get_client
+    from prefect.client.schemas.filters import TaskRunFilter, TaskRunFilterFlowRunId
+    from prefect.settings import PREFECT_API_URL, temporary_settings
+
+    found: dict[str, Counter[str]] = {}
+    with temporary_settings({PREFECT_API_URL: url}), get_client(sync_client=True) as client:
+        for run in client.read_flow_runs():
+            of_run = TaskRunFilter(flow_run_id=TaskRunFilterFlowRunId(any_=[run.id]))
+            tasks = client.read_task_runs(task_run_filter=of_run)
+            done = [task for task in tasks if task.state is not None and task.state.is_completed()]
+            found[str(run.id)] = Counter(task.task_key.split("-")[0] for task in done)
+    return found
 
 
 def test_a_missing_scheduler_is_told(archive: Path, tmp_path: Path, prefect_server: str) -> None:

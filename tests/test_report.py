@@ -128,7 +128,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for key in (work.records[stage]["run_key"],)
             if name in work.records[stage]["outputs"]
         }
-        history = published_tables(leading, tables)
+        history = published_tables([(leading, tables)])
         history["flight"] = rows_frame("flight", [flight_row(job, leading, facts)])
         history["run"] = rows_frame("run", run_rows(leading, work.records))
         publish(root, job.vehicle_id, history, [job.flight_id])

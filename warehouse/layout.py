@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import string
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from schemas import HISTORY_TABLES, SIGNAL_TABLES
 from warehouse.errors import disk
 
 _PLAIN = frozenset(f"{string.ascii_letters}{string.digits}._-".encode())
+_AS_IT_IS = re.compile(r"[A-Za-z0-9-][A-Za-z0-9._-]{0,149}")
 _EMPTY = "__HIVE_DEFAULT_PARTITION__"
 _LONGEST = 150
 _CUT = 100
@@ -24,6 +26,8 @@ _PARTITION = "vehicle_id="
 
 def encode_id(text: str) -> str:
     """Name of a file or folder for an id: one path component, never `.` or `..`, at most 150 bytes."""
+    if _AS_IT_IS.fullmatch(text):
+        return text
     raw = text.encode("utf-8", "surrogatepass")
     if not raw:
         return _EMPTY

@@ -12,7 +12,6 @@ import polars as pl
 from schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES
 from warehouse.layout import encode_id, history_files, history_path, signal_files, signal_path
 from warehouse.signals import signal_ids
-from warehouse.sql import run_sql
 from warehouse.store import empty_frame
 
 DEFAULT_ROOT = "fieldcal-data"
@@ -62,6 +61,8 @@ class Warehouse:
         WarehouseError
             `sql_refused`, `sql_wrong`, `sql_timeout`, `sql_too_large`.
         """
+        from warehouse.sql import run_sql  # DuckDB, which only questions in SQL need
+
         return run_sql(self.root, query, parameters, **limits)
 
     def _signals(self, table: str, vehicle_id: str | None, flight_id: str | None) -> pl.LazyFrame:

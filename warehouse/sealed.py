@@ -36,10 +36,11 @@ def unseal(data: bytes) -> dict[str, Any]:
     if not comma or head + _last_line(head + _END) != data:
         raise BrokenSeal("it is not what was written")
     try:
-        record = json.loads(data)
+        record: dict[str, Any] = json.loads(data)
     except ValueError as error:
         raise BrokenSeal("it is not JSON") from error
-    return {key: value for key, value in record.items() if key != _SEAL}
+    del record[_SEAL]
+    return record
 
 
 def _last_line(text: bytes) -> bytes:

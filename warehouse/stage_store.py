@@ -34,23 +34,16 @@ class StageStore:
 
     def record(self, stage: str, flight_id: str, run_key: str) -> dict[str, Any] | None:
         """What `save` was given as record, with `outputs` added; None when absent, torn or of another execution."""
-        path = self.folder(stage, flight_id, run_key) / RECORD
-        try:
-            found = unseal(path.read_bytes())
-        except (OSError, BrokenSeal):
-            return None
-        same = (found.get("stage"), found.get("flight_id"), found.get("run_key")) == (stage, flight_id, run_key)
-        return found if same else None
+        return _record(self.folder(stage, flight_id, run_key), stage, flight_id, run_key)
 
     def complete(self, stage: str, flight_id: str, run_key: str) -> dict[str, Any] | None:
         """The record, if the execution is complete: every output there with the sha256 it says; else None.
 
         The record's `outputs` is `{table: {"file", "sha256", "bytes", "rows"}}`.
         """
-        record = self.record(stage, flight_id, run_key)
-        if record is None:
-            return None
-        return None if any(broken_outputs(self.folder(stage, flight_id, run_key), record)) else record
+        folder = self.folder(stage, flight_id, run_key)
+        record = _record(folder, stage, flight_id, run_key)
+        return None if record is None or any(broken_outputs(folder, record)) else record
 
     def latest(self, stage: str, flight_id: str) -> dict[str, Any] | None:
         """The record last written for this stage of this flight, whatever its key; None when there is none."""
@@ -101,7 +94,7 @@ class StageStore:
             `stage_incomplete`: there is no such complete execution, or not that table in it.
         """
         folder = self.folder(stage, flight_id, run_key)
-        record = self.record(stage, flight_id, run_key)
+        record = _record(folder, stage, flight_id, run_key)
         if record is None:
             raise WarehouseError(
                 "stage_incomplete", f"{folder} holds no complete result of stage {stage}; run it again."
@@ -113,6 +106,15 @@ class StageStore:
                 "stage_incomplete", f"stage {stage} of this run wrote no table {absent[0]} ({folder})."
             )
         return {table: _output(folder, table, outputs[table]) for table in wanted}
+
+
+def _record(folder: Path, stage: str, flight_id: str, run_key: str) -> dict[str, Any] | None:
+    try:
+        found = unseal((folder / RECORD).read_bytes())
+    except (OSError, BrokenSeal):
+        return None
+    same = (found.get("stage"), found.get("flight_id"), found.get("run_key")) == (stage, flight_id, run_key)
+    return found if same else None
 
 
 def _written_ns(path: Path) -> int:

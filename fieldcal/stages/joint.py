@@ -28,6 +28,7 @@ from fieldcal.results import StageResult, fatal_fault, triad_rows
 from fieldcal.rotation import Array, from_matrix, multiply
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Settings, Tables, mean_temperature, reference_reading, refusal
+from fieldcal.stages.joint_reference import Poses, poses_of, with_poses
 
 METHOD = "joint"
 SENSORS = ("magnetometer", "accelerometer", "gyroscope")
@@ -62,12 +63,18 @@ def estimate_jointly(tables: Tables, s: Settings) -> StageResult:
         fit = fit_joint(model, start, try_lever_arm=arm is None)
     except (UnusableFlight, EstimationError) as error:
         return refusal(error, "joint estimate")
+    poses = poses_of(tables, s)
+    fit, by_vps = with_poses(fit, poses, s)
     result = _written(fit, tables, s, axes)
-    return replace(result, tables={**result.tables, **_held_out(fit, readings, tables, s, arm)})
+    return replace(
+        result,
+        tables={**result.tables, **_held_out(fit, readings, tables, s, arm, poses)},
+        measured={**result.measured, **by_vps},
+    )
 
 
 def _held_out(
-    fit: JointFit, readings: Readings, tables: Tables, s: Settings, arm: Array | None
+    fit: JointFit, readings: Readings, tables: Tables, s: Settings, arm: Array | None, poses: Poses | None
 ) -> dict[str, pl.DataFrame]:
     """Gyroscope constants from the first part of the flight alone, with `from_ns`, where the rest begins: `verify`
     predicts that. None where the part determines nothing."""
@@ -84,6 +91,7 @@ def _held_out(
     known = {name: fit.constants(name)[:2] for name in SENSORS if name in fit.layout}
     try:
         own = fit_joint(*joint_start.prepare(part, known, lever_arm=arm), try_lever_arm=arm is None)
+        own, _ = with_poses(own, poses, s)
     except (UnusableFlight, EstimationError):
         return {}
     scale, bias, covariance = own.constants("gyroscope")

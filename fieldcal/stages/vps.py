@@ -10,7 +10,7 @@ import polars as pl
 from fieldcal import sensor, smoothing, sync
 from fieldcal.errors import UnusableFlight
 from fieldcal.frames import AXES, QUATERNION, columns_of, constants, matrix, seconds, triad
-from fieldcal.results import StageResult
+from fieldcal.results import StageResult, fatal_fault
 from fieldcal.rotation import (
     Array,
     body_from_inertial,
@@ -24,7 +24,7 @@ from fieldcal.rotation import (
 )
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Settings, Tables
-from fieldcal.sync_attitude import refine_by_attitude
+from fieldcal.sync_field import refine_by_field
 
 NED_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # rotation of ENU components to NED
 
@@ -82,17 +82,8 @@ def synchronise_vps(tables: Tables, s: Settings) -> StageResult:
             {"status": "refused", "peak": error.measured.get("peak"), "runner_up": error.measured.get("runner_up")}
         )
         return StageResult({"sync": row}, "refused", error.reason_code, str(error), {**measured, **error.measured})
-    if "joint_attitude" in tables:
-        own_attitude = tables["joint_attitude"]
-        fit = refine_by_attitude(
-            seconds(own_attitude["t_ns"], origin),
-            matrix(own_attitude, QUATERNION),
-            own_attitude["segment"].to_numpy(),
-            t_vps,
-            q_vps,
-            fit,
-        )
-        measured["synchronised_by"] = "attitude"
+    fit, by_field = _refined(fit, tables, s, origin, t_vps, q_vps)
+    measured |= by_field
     row = _sync_row(
         {
             "lag_s": fit.lag_s - base_ns * 1e-9,
@@ -113,6 +104,28 @@ def synchronise_vps(tables: Tables, s: Settings) -> StageResult:
         {"t_ns": t_ns, **columns_of(aligned["q"], QUATERNION), **columns_of(aligned["rate"], RATE_COLUMNS)}
     )
     return StageResult({"sync": row, "vps_aligned": table}, measured=measured)
+
+
+def _refined(
+    fit: sync.SyncFit, tables: Tables, s: Settings, origin: int, t_vps: Array, q_vps: Array
+) -> tuple[sync.SyncFit, dict[str, Any]]:
+    """The clock by a sound magnetometer too, and what that found."""
+    told = [tables[name] for name in ("faults", "motor_faults") if name in tables]
+    table = tables.get("magnetometer_log")
+    if table is None or table.is_empty() or any(fatal_fault(faults, ("magnetometer",)) for faults in told):
+        return fit, {"synchronised_by": "gyroscope"}
+    logged = matrix(table, triad("magnetometer"))
+    refined, own = refine_by_field(
+        seconds(table["t_ns"], origin), logged, t_vps, q_vps, fit, max_gap_s=s["vps_max_gap_s"]
+    )
+    if own is None:
+        return fit, {"synchronised_by": "gyroscope"}
+    return refined, {
+        "synchronised_by": "gyroscope" if refined is fit else "gyroscope and magnetometer",
+        # Positive: the magnetometer's readings are older than the gyroscope's.
+        "magnetometer_delay_s": own.lag_mid_s - fit.lag_mid_s,
+        "magnetometer_delay_sd_s": float(np.sqrt(own.covariance[0, 0] + fit.covariance[0, 0])),
+    }
 
 
 def _sync_row(values: dict[str, Any]) -> pl.DataFrame:

@@ -1,0 +1,89 @@
+"""The joint estimate once more with the VPS in it (`use_vps`): prepare the poses, fit, tell what was used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fieldcal import sensor, sync
+from fieldcal.errors import EstimationError, UnusableFlight
+from fieldcal.frames import QUATERNION, matrix, seconds
+from fieldcal.joint import JointFit, fit_joint
+from fieldcal.joint_vps import VpsRecord
+from fieldcal.rotation import Array, continuous, to_rotation_vector
+from fieldcal.stages.attitude import sensor_attitude
+from fieldcal.stages.inputs import Settings, Tables
+from fieldcal.stages.vps import vps_attitude
+
+
+@dataclass(frozen=True)
+class Poses:
+    """VPS stamps (m,), s from the first sample (its epoch `base_s` taken off), and attitudes (m, 4) of the sensor
+    axes, outliers masked."""
+
+    t: Array
+    q: Array
+    base_s: float
+    max_gap_s: float
+
+
+def poses_of(tables: Tables, s: Settings) -> Poses | None:
+    """The log's VPS where `use_vps` asks for it and there is one."""
+    if not s["use_vps"] or "vps" not in tables or tables["vps"].is_empty():
+        return None
+    origin, stamps = int(tables["samples"]["t_ns"][0]), tables["vps"]["t_ns"]
+    base_ns = int(stamps[0]) - origin
+    length_s = (int(tables["samples"]["t_ns"][-1]) - origin) * 1e-9
+    if abs(base_ns) * 1e-9 <= s["vps_max_lag_s"] + length_s:
+        base_ns = 0
+    t, q = seconds(stamps, origin + base_ns), vps_attitude(matrix(tables["vps"], QUATERNION), s)
+    keep = sync.mask_outliers(t, q)
+    return Poses(t[keep], continuous(sensor_attitude(q[keep], s)), base_ns * 1e-9, s["vps_max_gap_s"])
+
+
+def with_poses(fit: JointFit, poses: Poses | None, s: Settings) -> tuple[JointFit, dict[str, Any]]:
+    """The fit with the VPS in it, and what was used; as it was, with the reason, where the VPS cannot be used."""
+    if poses is None:
+        return fit, {"use_vps": False} if s["use_vps"] else {}
+    readings = fit.model.readings
+    scale, bias, _ = fit.constants("gyroscope")
+    try:
+        clock = sync.synchronise(
+            readings.t,
+            sensor.calibrate(readings.gyroscope, scale, bias),
+            poses.t,
+            poses.q,
+            max_lag_s=s["vps_max_lag_s"],
+            min_peak=s["vps_min_peak"],
+            max_gap_s=poses.max_gap_s,
+        )
+        vps = VpsRecord.of(poses.t, poses.q, clock, fit.model, fit.state, fit.path, max_gap_s=poses.max_gap_s)
+        if vps is None:
+            return fit, {"use_vps": False, "use_vps_reason": "vps_too_short"}
+        start = replace(fit.state, values={**fit.state.values, **vps.start()})
+        own = fit_joint(
+            fit.model, start, try_lever_arm="lever_arm" in fit.layout, vps=vps, levels=fit.levels
+        )
+    except (UnusableFlight, EstimationError) as error:
+        return fit, {"use_vps": False, "use_vps_reason": error.reason_code}
+    return replace(own, iterations=fit.iterations + own.iterations), _told(own, vps, poses)
+
+
+def _told(fit: JointFit, vps: VpsRecord, poses: Poses) -> dict[str, Any]:
+    lag, skew = vps.clock_of(fit.state.values)
+    sd = np.sqrt(np.diagonal(fit.covariance)[fit.layout["vps_clock"]])
+    residual, known = vps.residual(fit.model, fit.state)
+    turned = to_rotation_vector(vps.mounting(fit.state.values))
+    return {
+        "use_vps": True,
+        "vps_poses": int(known.sum()),
+        "vps_poses_refused": int((~vps.used).sum()),
+        "vps_residual_deg": float(np.degrees(np.sqrt(np.mean(np.sum(residual[known] ** 2, axis=1))))),
+        "vps_lag_mid_s": lag - poses.base_s,
+        "vps_lag_sd_s": float(sd[0]),
+        "vps_skew_ppm": 1e6 * skew,
+        "vps_skew_sd_ppm": float(1e6 * sd[1]),
+        "vps_body_rotation_deg": float(np.degrees(np.linalg.norm(turned))),
+    }
