@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from fieldcal.drift_evidence import REFERENCE_DEGC
 from fieldcal.rotation import Array
 
-REFERENCE_DEGC = 25.0
 ORDER = 3
 SIGNIFICANT_SIGMAS = 4.0
 """A bend is believed beyond this: its sd comes from few flights."""

@@ -11,12 +11,12 @@ import numpy as np
 import polars as pl
 
 from fieldcal.drift import Trends
+from fieldcal.drift_evidence import REFERENCE_DEGC
 from fieldcal.histories import Histories
 from fieldcal.rotation import Array
 from fieldcal.stages.warm_up import CURVE, METHOD, PARAMETER
 from fieldcal.temperature_curve import (
     ORDER,
-    REFERENCE_DEGC,
     Curve,
     about_reference,
     combined,
