@@ -38,18 +38,19 @@ def dead(root: Path) -> list[Path]:
     """Marks, named by flow run id, of runs whose process died before they ended."""
     folder = root / FOLDER
     marks = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [mark for mark in marks if not mark.name.startswith(".") and _is_free(mark)]
+    return [mark for mark in marks if not mark.name.startswith(".") and mark.exists() and not is_held(mark)]
 
 
-def _is_free(mark: Path) -> bool:
+def is_held(path: Path) -> bool:
+    """Whether a process holds the lock of this file; one that cannot be opened counts as free."""
     try:
-        descriptor = os.open(mark, os.O_RDWR | os.O_CLOEXEC)
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
         return False
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
-        return False
+        return True
     finally:
         os.close(descriptor)
-    return True
+    return False

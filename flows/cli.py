@@ -17,6 +17,7 @@ from flows.cli_report import report as report_command
 from flows.cli_serve import serve, trigger
 from flows.cli_simulate import simulate
 from flows.interrupt import interruptible
+from flows.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
 
 OK, FAILED, USAGE, LOSSES, BUSY, INTERRUPTED = 0, 1, 2, 3, 75, 130
 USAGE_CODES = ("not_found", "no_archive", "no_session", "sql_refused", "sql_wrong", "wrong_option")
@@ -30,20 +31,6 @@ app = App(
     suppress_keyboard_interrupt=False,
     default_parameter=Parameter(negative=""),
 )
-
-Config = Annotated[Path | None, Parameter(help="fieldcal.toml to use; else the archive's own, if it has one.")]
-Root = Annotated[
-    Path | None, Parameter(name="--warehouse", help="Data root; else FIELDCAL_WAREHOUSE, else ./fieldcal-data.")
-]
-AsJson = Annotated[bool, Parameter(name="--json", help="One JSON document on stdout.")]
-AsCsv = Annotated[bool, Parameter(name="--csv", help="CSV on stdout.")]
-DryRun = Annotated[bool, Parameter(help="List what would run; change nothing.")]
-Workers = Annotated[int, Parameter(help="Processes that calibrate; results do not depend on it.")]
-Runner = Annotated[
-    Literal["process", "dask", "pool"],
-    Parameter(help="Where they run: on this machine, on a Dask cluster, or in the work pool of prefect.yaml."),
-]
-Scheduler = Annotated[str | None, Parameter(help="Address of the Dask scheduler; else a cluster on this machine.")]
 
 
 @app.command
@@ -135,7 +122,7 @@ def nightly(
 
 @app.command
 def session(
-    folder: Annotated[Path, Parameter(name="SESSION_DIR")],
+    folder: SessionFolder,
     /,
     *,
     workers: Workers = 1,

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from cyclopts import Parameter
+from flows.options import AsCsv, AsJson, Root, UnusedConfig
 
 SHOWN = (
     "vehicle_id",
@@ -35,12 +34,10 @@ def drift(
     vehicle: str | None = None,
     sensor: Literal["magnetometer", "accelerometer", "gyroscope", "vps", "fit"] | None = None,
     parameter: str | None = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative="", help="One JSON document on stdout.")] = False,
-    as_csv: Annotated[bool, Parameter(name="--csv", negative="", help="CSV on stdout.")] = False,
-    warehouse: Annotated[
-        Path | None, Parameter(name="--warehouse", help="Data root; else FIELDCAL_WAREHOUSE, else ./fieldcal-data.")
-    ] = None,
-    config: Annotated[Path | None, Parameter(show=False)] = None,
+    as_json: AsJson = False,
+    as_csv: AsCsv = False,
+    warehouse: Root = None,
+    config: UnusedConfig = None,
 ) -> int:
     """Trends of calibrated parameters over temperature and time, what is not stable first.
 

@@ -7,10 +7,9 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from flows.options import AsJson, Config, Output, Root, UnusedConfig
+
 Format = Literal["px4", "ardupilot", "ros", "kalibr", "json", "c"]
-Root = Annotated[
-    Path | None, Parameter(name="--warehouse", help="Data root; else FIELDCAL_WAREHOUSE, else ./fieldcal-data.")
-]
 
 
 def export(
@@ -19,9 +18,9 @@ def export(
     *,
     to: Annotated[Format, Parameter(name=["--format", "-f"])] = "json",
     at_temperature: float | None = None,
-    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    output: Output = None,
     warehouse: Root = None,
-    config: Annotated[Path | None, Parameter(show=False)] = None,
+    config: UnusedConfig = None,
 ) -> int:
     """The constants to fly with: what the target cannot hold is told on stderr.
 
@@ -59,9 +58,9 @@ def apply(
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     vehicle: str | None = None,
     at_temperature: float | None = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative="", help="One JSON document on stdout.")] = False,
+    as_json: AsJson = False,
     warehouse: Root = None,
-    config: Annotated[Path | None, Parameter(help="fieldcal.toml to use; else the archive's own.")] = None,
+    config: Config = None,
 ) -> int:
     """Calibrated readings of a log by the constants its vehicle flies with; the log stays as it is.
 

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
+from flows.options import AsJson, Output, Root, UnusedConfig
 
 
 def report(
     *,
     vehicle: str | None = None,
     flight: str | None = None,
-    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    output: Output = None,
     as_of: str | None = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative="", help="One JSON document on stdout.")] = False,
-    warehouse: Annotated[
-        Path | None, Parameter(help="Data root; else FIELDCAL_WAREHOUSE, else ./fieldcal-data.")
-    ] = None,
-    config: Annotated[Path | None, Parameter(show=False)] = None,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: UnusedConfig = None,
 ) -> int:
     """Write a report as one HTML file that needs no network: the fleet, or one vehicle, or one flight.
 

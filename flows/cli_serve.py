@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated
 
-from cyclopts import Parameter
+from flows.options import AsJson, Config, Root, SessionFolder
 
 EVERY_NIGHT = "0 3 * * *"
-Root = Annotated[
-    Path | None, Parameter(name="--warehouse", help="Data root; else FIELDCAL_WAREHOUSE, else ./fieldcal-data.")
-]
-Config = Annotated[Path | None, Parameter(help="fieldcal.toml to use; else the archive's own, if it has one.")]
 
 
 def serve(
@@ -77,10 +72,10 @@ def serve(
 
 
 def trigger(
-    folder: Annotated[Path, Parameter(name="SESSION_DIR")],
+    folder: SessionFolder,
     /,
     *,
-    as_json: Annotated[bool, Parameter(name="--json", negative="", help="One JSON document on stdout.")] = False,
+    as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
 ) -> int:

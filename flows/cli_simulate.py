@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from flows.options import AsJson, UnusedConfig, UnusedRoot
+
 OFF = Parameter(negative="")
 
 
@@ -38,9 +40,9 @@ def simulate(
     no_quantisation: Annotated[bool, OFF] = False,
     no_band_limit: Annotated[bool, OFF] = False,
     no_vps: Annotated[bool, OFF] = False,
-    as_json: Annotated[bool, Parameter(name="--json", negative="", help="One JSON document on stdout.")] = False,
-    warehouse: Annotated[Path | None, Parameter(show=False)] = None,
-    config: Annotated[Path | None, Parameter(show=False)] = None,
+    as_json: AsJson = False,
+    warehouse: UnusedRoot = None,
+    config: UnusedConfig = None,
 ) -> int:
     """Write simulated logs and, beside each, the truth.
 

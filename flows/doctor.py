@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import importlib.metadata
 import os
 import platform
@@ -19,7 +18,7 @@ from packaging.requirements import Requirement
 
 import fieldcal
 from flows.alive import FOLDER as RUNNING
-from flows.alive import dead
+from flows.alive import dead, is_held
 from flows.server import answers, no_answer, serving_address
 
 OK, WARNING, FAILED = "ok", "warning", "failed"
@@ -146,25 +145,11 @@ def _open_files() -> Check:
 
 
 def _locks(root: Path) -> Iterator[Check]:
-    held = [path for path in sorted(root.glob(".lock-*")) if _is_held(path)]
+    held = [path for path in sorted(root.glob(".lock-*")) if is_held(path)]
     names = ", ".join(path.name.removeprefix(".lock-") for path in held[:5])
     yield Check("locks", OK, f"being published now: {names}" if held else "free")
     if (root / RUNNING).is_dir() and (abandoned := dead(root)):
         yield Check("runs", WARNING, f"{len(abandoned)} were killed", "The next night marks them as crashed.")
-
-
-def _is_held(path: Path) -> bool:
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
 
 
 def _server(root: Path) -> Check:

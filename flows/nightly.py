@@ -16,12 +16,10 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import cloudpickle
 import polars as pl
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import State, StateDetails
-from prefect.context import hydrated_context
 from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.states import Completed
 
@@ -36,7 +34,8 @@ from flows.log_ledger import write_ledger
 from flows.outcome import Outcome, summary
 from flows.plan import Plan, make_plan
 from flows.pool import hand_over, pool_answers
-from flows.runners import Answers, Parallel, batches, dask_answers, process_answers, processes_begun
+from flows.processes import process_answers, processes_begun
+from flows.runners import Answers, Parallel, batches, dask_answers
 from flows.show import say
 from flows.source_ledger import know_sources
 from flows.steps import FlightWork, Record, code_digest
@@ -79,16 +78,6 @@ def run_step(flight_id: str, step: str, log_uri: str) -> State[Any]:
 def run_batch(number: int, root: str, source: Source, jobs: list[dict[str, Any]], code: str) -> dict[str, Any]:
     """A batch of flights, every step a task (`flows.flights.flights`)."""
     return flights(root, source, jobs, code, _as_task, tell_done)
-
-
-def _batch_in_process(context: bytes, given: dict[str, Any]) -> dict[str, Any]:
-    """A batch in another process of this machine, within the night's flow run."""
-    with hydrated_context(cloudpickle.loads(context)):
-        return run_batch(**given)
-
-
-def _ready() -> None:
-    """What a process does that has only to be there."""
 
 
 @flow(name="batch", persist_result=False, validate_parameters=False)
@@ -178,7 +167,7 @@ def prepared(
     _planned[(root_of_logs, root, config, only)] = source, settings, plan
     n_batches = len(batches(_missing(plan), parallel.workers))
     spawned = parallel.runner == "process" and not parallel.in_this_process(n_batches)
-    with processes_begun(parallel.workers, _ready) if spawned else nullcontext():
+    with processes_begun(parallel.workers) if spawned else nullcontext():
         yield
 
 
@@ -259,7 +248,7 @@ def _answers(parallel: Parallel, inputs: list[dict[str, Any]]) -> Answers:
         return pool_answers(inputs)
     if parallel.runner == "dask":
         return dask_answers(parallel, run_batch, inputs)
-    return process_answers(parallel.workers, _batch_in_process, inputs)
+    return process_answers(parallel.workers, inputs)
 
 
 def _missing(plan: Plan) -> list[Job]:

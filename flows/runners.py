@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
 from typing import TYPE_CHECKING, Any
 
 from fieldcal.errors import FieldcalError
@@ -20,7 +17,6 @@ RUNNERS = ("process", "dask", "pool")
 LARGEST_BATCH = 40
 SMALLEST_BATCH = 2
 SHARE_OF_A_WORKER = 4
-LISTEN_S = 0.25
 
 
 @dataclass(frozen=True)
@@ -65,41 +61,6 @@ def batches(jobs: Sequence[Job], workers: int) -> list[list[Job]]:
 Answers = Iterator[tuple[dict[str, Any], dict[str, Any] | Exception]]
 """Each input with what came back, in the order in which they end."""
 
-_begun: list[ProcessPoolExecutor] = []
-
-
-@contextmanager
-def processes_begun(workers: int, ready: Callable[[], None]) -> Iterator[None]:
-    """Within the block processes start and, to find `ready`, import its module; `process_answers` takes them."""
-    with _processes(workers) as pool:
-        for _ in range(workers):
-            pool.submit(ready)
-        _begun.append(pool)
-        try:
-            yield
-        finally:
-            _begun.clear()
-
-
-def process_answers(workers: int, run: Callable[..., dict[str, Any]], inputs: Sequence[dict[str, Any]]) -> Answers:
-    """Run `run(context, input)` in processes of this machine; `context` is Prefect's, of the flow run, pickled."""
-    import cloudpickle
-    from prefect.context import serialize_context
-
-    context = cloudpickle.dumps(serialize_context())
-    with nullcontext(_begun.pop()) if _begun else _processes(workers) as pool:
-        waiting: dict[Future[dict[str, Any]], dict[str, Any]] = {}
-        waiting |= {pool.submit(run, context, given): given for given in inputs}
-        while waiting:
-            # A wait without end would not hear Ctrl-C.
-            for future in wait(waiting, LISTEN_S, FIRST_COMPLETED).done:
-                yield waiting.pop(future), _answer(future)
-        pool.shutdown(wait=False)  # they tell Prefect the rest while the night publishes
-
-
-def _processes(workers: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
-
 
 def dask_answers(parallel: Parallel, task: Task[Any, dict[str, Any]], inputs: Sequence[dict[str, Any]]) -> Answers:
     """Run `task` on a Dask cluster: the one of the scheduler, or one of this machine.
@@ -114,10 +75,11 @@ def dask_answers(parallel: Parallel, task: Task[Any, dict[str, Any]], inputs: Se
     with _dask(parallel) as runner:
         waiting = {runner.submit(task, given): given for given in inputs}
         for future in as_completed(list(waiting)):
-            yield waiting[future], _answer(future)
+            yield waiting[future], answer_of(future)
 
 
-def _answer(future: Any) -> dict[str, Any] | Exception:
+def answer_of(future: Any) -> dict[str, Any] | Exception:
+    """What a finished batch came back with."""
     try:
         answer: dict[str, Any] = future.result()
     except Exception as error:

@@ -1,0 +1,27 @@
+"""Options that several commands have alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+Config = Annotated[Path | None, Parameter(help="fieldcal.toml to use; else the archive's own, if it has one.")]
+UnusedConfig = Annotated[Path | None, Parameter(show=False)]
+"""Every command takes `--config`; these need nothing of it."""
+Root = Annotated[
+    Path | None, Parameter(name="--warehouse", help="Data root; else FIELDCAL_WAREHOUSE, else ./fieldcal-data.")
+]
+UnusedRoot = Annotated[Path | None, Parameter(show=False)]
+AsJson = Annotated[bool, Parameter(name="--json", negative="", help="One JSON document on stdout.")]
+AsCsv = Annotated[bool, Parameter(name="--csv", negative="", help="CSV on stdout.")]
+DryRun = Annotated[bool, Parameter(help="List what would run; change nothing.")]
+Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
+SessionFolder = Annotated[Path, Parameter(name="SESSION_DIR")]
+Workers = Annotated[int, Parameter(help="Processes that calibrate; results do not depend on it.")]
+Runner = Annotated[
+    Literal["process", "dask", "pool"],
+    Parameter(help="Where they run: on this machine, on a Dask cluster, or in the work pool of prefect.yaml."),
+]
+Scheduler = Annotated[str | None, Parameter(help="Address of the Dask scheduler; else a cluster on this machine.")]

@@ -1,0 +1,74 @@
+"""Batches in spawned processes of this machine, within the night's flow run.
+
+A module of its own, because Prefect may load `flows.nightly` under another name, which other processes would not find.
+Each process tells Prefect's server of its tasks itself: through this one every event would be sent twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager, nullcontext
+from multiprocessing import get_context
+from typing import Any
+
+from flows.runners import Answers, answer_of
+
+LISTEN_S = 0.25
+
+_begun: list[ProcessPoolExecutor] = []
+
+
+@contextmanager
+def processes_begun(workers: int) -> Iterator[None]:
+    """Within the block processes start and import what a batch needs; `process_answers` takes them."""
+    with _processes(workers) as pool:
+        for _ in range(workers):
+            pool.submit(_import)
+        _begun.append(pool)
+        try:
+            yield
+        finally:
+            _begun.clear()
+
+
+def process_answers(workers: int, inputs: Sequence[dict[str, Any]]) -> Answers:
+    """Run the batches; call it within the flow run that their tasks belong to."""
+    context = _context()
+    with nullcontext(_begun.pop()) if _begun else _processes(workers) as pool:
+        waiting: dict[Future[dict[str, Any]], dict[str, Any]] = {}
+        waiting |= {pool.submit(_batch, context, given): given for given in inputs}
+        while waiting:
+            # A wait without end would not hear Ctrl-C.
+            for future in wait(waiting, LISTEN_S, FIRST_COMPLETED).done:
+                yield waiting.pop(future), answer_of(future)
+        pool.shutdown(wait=False)  # they tell Prefect the rest while the night publishes
+
+
+def _processes(workers: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+
+
+def _context() -> dict[str, Any]:
+    """Prefect's context, with the name of its flow instead of the flow: a function is not sent."""
+    from prefect.context import serialize_context
+
+    context = serialize_context()
+    run = context["flow_run_context"]
+    return {**context, "flow_run_context": {**run, "flow": run["flow"].name}}
+
+
+def _import() -> None:
+    import flows.nightly  # noqa: F401
+
+
+def _batch(context: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """One batch, in one of the processes."""
+    from prefect.context import hydrated_context
+
+    from flows import nightly
+
+    run = context["flow_run_context"]
+    flow = {own.name: own for own in (nightly.nightly, nightly.session)}[run["flow"]]
+    with hydrated_context({**context, "flow_run_context": {**run, "flow": flow}}):
+        return nightly.run_batch(**given)
