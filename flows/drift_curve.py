@@ -24,6 +24,7 @@ from fieldcal.temperature_curve import (
     together,
     widening,
 )
+from fieldcal.warm_up import SCALE_PER_DEGC_SD
 from warehouse import Warehouse
 
 Source = tuple[Array, Array]
@@ -96,7 +97,8 @@ def bent(flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends: Trends
             own = _members(h, j)
             warmer = np.nan_to_num(h.temperature_degc[own] - REFERENCE_DEGC)
             value[own] -= factor * (curve.coefficients[1] * warmer**2 + curve.coefficients[2] * warmer**3)
-            slope[j], slope_sd[j] = factor * known[0], abs(factor) * known[1]
+            of_scale = SCALE_PER_DEGC_SD * abs(float(trends.value[j])) if name == "zero_bias" else 0.0
+            slope[j], slope_sd[j] = factor * known[0], np.hypot(factor * known[1], of_scale)
             own, variance = _flights(h, j, trends)
             told = None if curve.agrees is False else warm[imu_id, axis][1] / factor**2
             wider[j] = widening(h.temperature_degc[own], h.time_day[own], variance, told)
@@ -108,7 +110,7 @@ def bent(flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends: Trends
 
 def _warm(flights: pl.DataFrame, bends: Bends) -> dict[tuple[str, str], Source]:
     """(IMU, axis) → what its warm-up flights say together; their scatter about it widens it."""
-    own = flights.filter((pl.col("method") == METHOD) & (pl.col("parameter") == PARAMETER))
+    own = flights.filter(sensor="gyroscope", method=METHOD, parameter=PARAMETER)
     sources: dict[tuple[str, str], list[Source]] = {}
     for imu_id, flight_id, axis in own.select("imu_id", "flight_id", "axis").iter_rows():
         if (flight_id, axis) in bends:
