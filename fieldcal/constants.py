@@ -1,6 +1,6 @@
 """The constants an aircraft flies with, and what they make of readings: the model that every export is a form of.
 
-    z = Λ(T) (z_d − zero(T)),  Λ(T) = Λ + Λ' (T − T0),  zero(T) = zero + zero' (T − T0)
+    z = Λ(T) (z_d − zero(T)),  Λ(T) = Λ + Λ' d,  zero(T) = zero + zero₁ d + zero₂ d² + zero₃ d³,  d = T − T0
 
 Eq. 5 with its offset in logged units: autopilots subtract before they scale, and `zero` keeps a counts log's digits.
 """
@@ -8,7 +8,7 @@ Eq. 5 with its offset in logged units: autopilots subtract before they scale, an
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,11 +18,17 @@ from fieldcal.rotation import Array
 SENSORS = ("gyroscope", "accelerometer", "magnetometer")
 
 
+def cubic_about(first: Array, second: Array, third: Array, by_degc: float) -> tuple[Array, Array, Array]:
+    """Coefficients of d, d² and d³ of a cubic that had these about a point `by_degc` below: c(d + by) − c(by)."""
+    return first + 2.0 * second * by_degc + 3.0 * third * by_degc**2, second + 3.0 * third * by_degc, third
+
+
 @dataclass(frozen=True)
 class Triad:
     """Constants of one triad at `temperature_degc` T0, sensor axes as logged.
 
-    `scale` (3, 3) in `unit` per `logged_unit`, `zero` (3,) in `logged_unit`, their slopes per °C (0 where unknown),
+    `scale` (3, 3) in `unit` per `logged_unit`, `zero` (3,) in `logged_unit`, their slopes per °C (0 where unknown), the
+    zero's bend per °C² and °C³ (0 where none is known),
     sd of the diagonal and of zero (3,). `flown_degc`: lowest and highest temperature of the history, None without a
     slope. `why`: where the numbers come from.
     """
@@ -38,6 +44,8 @@ class Triad:
     temperature_degc: float
     flown_degc: tuple[float, float] | None
     why: tuple[str, ...]
+    zero_per_degc2: Array = field(default_factory=lambda: np.zeros(3))
+    zero_per_degc3: Array = field(default_factory=lambda: np.zeros(3))
 
     @property
     def diagonal(self) -> bool:
@@ -51,7 +59,8 @@ class Triad:
             return np.asarray((z - self.zero) @ self.scale.T)
         warmer = np.asarray(temperature_degc, dtype=float) - self.temperature_degc
         warmer = np.where(np.isfinite(warmer), warmer, 0.0)[:, None]
-        off = z - self.zero - warmer * self.zero_per_degc
+        bend = self.zero_per_degc2 + warmer * self.zero_per_degc3
+        off = z - self.zero - warmer * (self.zero_per_degc + warmer * bend)
         return np.asarray(off @ self.scale.T + warmer * (off @ self.scale_per_degc.T))
 
 

@@ -14,37 +14,19 @@ over temperature bends is told with its bend as scatter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy import special, stats
+from scipy import stats
 
-from fieldcal.change_points import scatter_variance, strongest_step, temperature_slope
+from fieldcal.drift_evidence import FALSE_ALARMS, MOST_STEPS, Evidence, evidence
 from fieldcal.fleet import LEAST_FREEDOM, moderated_variance
-from fieldcal.histories import (
-    ENOUGH_SESSIONS,
-    FLOOR,
-    LEVEL,
-    TEMPERATURE,
-    TIME,
-    Histories,
-    Prepared,
-    largest,
-    prepare,
-)
-from fieldcal.random_effects import Grouping, Regression, fit_random_effects
+from fieldcal.histories import ENOUGH_SESSIONS, LEVEL, Histories, prepare
+from fieldcal.random_effects import fit_random_effects
 from fieldcal.rotation import Array
 
-REFERENCE_DEGC = 25.0
-FALSE_ALARMS = 0.01
-"""Share of the alarms of one kind (drift, step) that may be false, over all rows (Benjamini and Hochberg)."""
 FALSE_OUTLIERS = 0.05
-"""The same for outliers among siblings, which claim less: nothing has changed."""
-MOST_STEPS = 3
-STEPS_THAT_DRIFT = 0.05
-"""Share of stepping units that are taken to drift as well, before their record is looked at. A slope in time and a step
-tell much the same story: a slope that is not there would double the sd of the step's size, one that is there and left
-out would shift it."""
+"""Share of false alarms (`FALSE_ALARMS`) for outliers among siblings, which claim less: nothing has changed."""
 LEAST_LEFT = 0.05
 """Share of a flight's variance that is left to it, at least, however much it draws the line to itself."""
 
@@ -96,16 +78,69 @@ def analyse(h: Histories) -> Trends:
     ValueError
         Rows not ascending from 0 or one left out, or a value that is not finite.
     """
-    p = prepare(h)
-    steps, step_p = _steps(p)
-    design = np.column_stack([p.regressors, _step_columns(p.grouping, steps)])
-    known, known_variance = _known(h, p, design.shape[1])
-    fit = fit_random_effects(
-        p.grouping, design, p.y, p.variance, p.keep, known=known, known_variance=known_variance
+    return judge(evidence(h), h.kind)
+
+
+def judge(e: Evidence, kind: np.ndarray | None = None) -> Trends:
+    """What the evidence says once the rows of a fleet are seen together: how many steps each has, and its scatter.
+
+    `kind` (g,): equal for siblings, whose scatter is alike; without it every row keeps its own.
+    """
+    steps = _steps(e)
+    told = {name: column[np.arange(len(steps)), steps] for name, column in e.told.items()}
+    session, flight, freedom = told["session_variance"], told["flight_variance"], told["freedom"]
+    ratio = np.ones(len(steps))
+    if kind is not None:
+        claimed = e.mean_variance + flight
+        total = np.where(e.enough, session + claimed, np.nan)
+        moderated, lent = moderated_variance(np.asarray(kind), total * e.unit**2, freedom)
+        moderated = moderated / e.unit**2
+        ratio = np.where(e.enough, moderated / total, 1.0)
+        session = np.where(e.enough, np.maximum(moderated - claimed, 0.0), session)
+        freedom = np.where(e.enough, lent, freedom)
+    wider = np.sqrt(ratio)
+    drift_p = 2.0 * stats.t.sf(np.abs(told["drift_z"] / wider), np.maximum(freedom, LEAST_FREEDOM))
+    v = e.last_variance + session + flight
+    line = told["last_line"] * ratio
+    spread = np.where(e.last_kept, np.maximum(v - line, LEAST_LEFT * v), v + line)
+    several = e.n_sessions >= 2
+    return Trends(
+        n_flights=e.n_flights,
+        n_sessions=e.n_sessions,
+        value=told["value"],
+        sd=told["sd"] * wider,
+        slope_per_degc=told["slope_per_degc"],
+        slope_per_degc_sd=told["slope_per_degc_sd"] * wider,
+        slope_per_day=told["slope_per_day"],
+        slope_per_day_sd=told["slope_per_day_sd"] * wider,
+        best_degc=told["best_degc"],
+        best_day=told["best_day"],
+        session_sd=np.where(several, e.unit * np.sqrt(session), np.nan),
+        flight_sd=np.where(several, e.unit * np.sqrt(flight), np.nan),
+        last_z=np.where(e.enough & e.timed, told["last_error"] / np.sqrt(spread), np.nan),
+        change_day=told["change_day"],
+        change_size=told["change_size"],
+        change_size_sd=told["change_size_sd"],
+        drift_p=np.where(freedom > LEAST_FREEDOM, drift_p, np.nan),
+        step_p=np.where(e.enough & e.timed, e.step_p[:, 0], np.nan),
+        moved=told["moved"] / np.sqrt(e.mean_variance + session + flight),
+        kept=e.kept,
     )
-    if h.kind is not None:
-        fit = _among_siblings(fit, p, np.asarray(h.kind))
-    return _told(h, p, design, fit, steps, step_p)
+
+
+def _steps(e: Evidence) -> np.ndarray:
+    """How many steps (g,) each row has: one more where its next strongest stands out among all rows."""
+    searched = e.enough & e.timed
+    searching, steps = searched.copy(), np.zeros(len(searched), dtype=int)
+    for _ in range(MOST_STEPS):
+        p_value = e.step_p[np.arange(len(steps)), np.minimum(steps, MOST_STEPS - 1)]
+        found = np.zeros(len(searched), dtype=bool)
+        found[searched] = alarms(p_value[searched])
+        searching &= found
+        if not searching.any():
+            break
+        steps += searching
+    return steps
 
 
 def moving(trends: Trends) -> tuple[np.ndarray, np.ndarray]:
@@ -148,180 +183,3 @@ def pooled(h: Histories) -> tuple[Array, Array]:
     everything = np.ones(len(p.y), dtype=bool)
     fit = fit_random_effects(p.grouping, p.regressors[:, :1], p.y, p.variance, everything)
     return p.centre + p.unit * fit.coefficients[:, LEVEL], p.unit * np.sqrt(fit.covariance[:, LEVEL, LEVEL])
-
-
-def _steps(p: Prepared) -> tuple[np.ndarray, Array]:
-    """(first session after each step (g, MOST_STEPS), −1: none; p-value of the strongest step (g,)).
-
-    Session means are searched, level, temperature and time fitted along: a steady drift is not a step."""
-    grouping, owner = p.grouping, p.grouping.row_of_session
-    weight = p.keep / p.variance
-    information = grouping.by_session(weight)
-    there = information > 0.0
-    safe = np.where(there, information, 1.0)
-    mean = grouping.by_session(np.column_stack([p.regressors, p.y]) * weight[:, None]) / safe[:, None]
-    x, level, claimed = mean[:, :-1], mean[:, -1], np.where(there, 1.0 / safe, 0.0)
-    present = np.flatnonzero(there)
-    slope = temperature_slope(owner[present], level[present], x[present, TEMPERATURE], grouping.n_rows)
-    residual = level[present] - slope[owner[present]] * x[present, TEMPERATURE]
-    between = scatter_variance(owner[present], residual, claimed[present], grouping.n_rows)
-    weight = np.where(there, 1.0 / (claimed + between[owner] + FLOOR**2), 0.0)
-    steps = np.full((grouping.n_rows, MOST_STEPS), -1)
-    searched = p.enough & p.timed
-    searching, strongest_p = searched.copy(), np.full(grouping.n_rows, np.nan)
-    for i in range(MOST_STEPS):
-        index, p_value = strongest_step(owner, x, level, weight, grouping.n_rows)
-        if i == 0:
-            strongest_p[searched] = p_value[searched]
-        found = np.zeros(grouping.n_rows, dtype=bool)
-        found[searched] = alarms(p_value[searched])
-        searching &= found
-        steps[searching, i] = index[searching]
-        if not searching.any():
-            break
-        after = searching[owner] & (np.arange(len(owner)) >= index[owner])
-        x = np.column_stack([x, after & there])
-    return steps, strongest_p
-
-
-def _step_columns(grouping: Grouping, steps: np.ndarray) -> Array:
-    """(n, up to MOST_STEPS): 1 after the step; as many columns as the row with most steps has."""
-    used = int((steps >= 0).sum(axis=1).max())
-    first = steps[grouping.row, :used]
-    return ((first >= 0) & (grouping.session[:, None] >= first)).astype(float)
-
-
-def _known(h: Histories, p: Prepared, n_columns: int) -> tuple[Array | None, Array | None]:
-    """The warm-up flights' slope in the coordinates of the regression."""
-    if h.slope_per_degc is None or h.slope_per_degc_sd is None:
-        return None, None
-    known, variance = np.zeros((len(p.unit), n_columns)), np.full((len(p.unit), n_columns), np.inf)
-    factor = p.x_width[:, TEMPERATURE] / p.unit
-    there = np.isfinite(h.slope_per_degc) & np.isfinite(h.slope_per_degc_sd) & (h.slope_per_degc_sd > 0)
-    known[there, TEMPERATURE] = (h.slope_per_degc * factor)[there]
-    variance[there, TEMPERATURE] = ((h.slope_per_degc_sd * factor) ** 2)[there]
-    return known, variance
-
-
-def _among_siblings(fit: Regression, p: Prepared, kind: np.ndarray) -> Regression:
-    """The scatter of each row, claims included, drawn towards its siblings' (`fleet.moderated_variance`)."""
-    claimed = p.mean_variance + fit.flight_variance
-    total = np.where(p.enough, fit.session_variance + claimed, np.nan)
-    moderated, freedom = moderated_variance(kind, total * p.unit**2, fit.freedom)
-    moderated = moderated / p.unit**2
-    ratio = np.where(p.enough, moderated / total, 1.0)
-    return replace(
-        fit,
-        covariance=fit.covariance * ratio[:, None, None],
-        session_variance=np.where(p.enough, np.maximum(moderated - claimed, 0.0), fit.session_variance),
-        freedom=np.where(p.enough, freedom, fit.freedom),
-    )
-
-
-def _told(h: Histories, p: Prepared, design: Array, fit: Regression, steps: np.ndarray, step_p: Array) -> Trends:
-    """The regression in the units of the rows."""
-    last = p.last(p.keep)
-    there, several = last >= 0, p.n_sessions >= 2
-    warm, timed = fit.active[:, TEMPERATURE], fit.active[:, TIME]
-    direction = design[np.maximum(last, 0)].copy()
-    with np.errstate(invalid="ignore"):
-        to_reference = (REFERENCE_DEGC - p.x_centre[:, TEMPERATURE]) / p.x_width[:, TEMPERATURE]
-    direction[:, TEMPERATURE] = np.where(warm, to_reference, 0.0)
-    value = p.centre + p.unit * np.einsum("gp,gp->g", direction, fit.coefficients)
-    with_all = np.einsum("gpq,gq->gp", fit.covariance, direction)
-    sd = p.unit * np.sqrt(np.maximum(np.einsum("gp,gp->g", direction, with_all), 0.0))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        drift_z = fit.coefficients[:, TIME] / np.sqrt(fit.covariance[:, TIME, TIME])
-        to_best, earlier = (
-            with_all[:, column] / fit.covariance[:, column, column] * p.x_width[:, column]
-            for column in (TEMPERATURE, TIME)
-        )
-    freedom = np.maximum(fit.freedom, LEAST_FREEDOM)
-    drift_p = np.where(timed & (fit.freedom > LEAST_FREEDOM), 2.0 * stats.t.sf(np.abs(drift_z), freedom), np.nan)
-    single = np.sqrt(p.mean_variance + fit.session_variance + fit.flight_variance)
-    time, g = p.keep * design[:, TIME], len(p.unit)
-    span = largest(h.row, time, g) + largest(h.row, -time, g)
-    change_day, size, size_sd = _latest_step(h, p, design, steps)
-
-    def only(mask: np.ndarray, x: Array) -> Array:
-        return np.where(mask, x, np.nan)
-
-    def slope(column: int) -> tuple[Array, Array]:
-        factor = only(fit.active[:, column], p.unit / p.x_width[:, column])
-        variance = np.maximum(fit.covariance[:, column, column], 0.0)
-        return factor * fit.coefficients[:, column], factor * np.sqrt(variance)
-
-    (per_degc, per_degc_sd), (per_day, per_day_sd) = slope(TEMPERATURE), slope(TIME)
-    return Trends(
-        n_flights=p.n_flights,
-        n_sessions=p.n_sessions,
-        value=only(there, value),
-        sd=only(there, sd),
-        slope_per_degc=per_degc,
-        slope_per_degc_sd=per_degc_sd,
-        slope_per_day=per_day,
-        slope_per_day_sd=per_day_sd,
-        best_degc=np.where(warm, REFERENCE_DEGC - to_best, p.x_centre[:, TEMPERATURE]),
-        best_day=only(there & fit.active[:, TIME], h.time_day[np.maximum(last, 0)] - earlier),
-        session_sd=only(several, p.unit * np.sqrt(fit.session_variance)),
-        flight_sd=only(several, p.unit * np.sqrt(fit.flight_variance)),
-        last_z=only(p.enough & p.timed, _last_distance(p, design, fit)),
-        change_day=change_day,
-        change_size=size,
-        change_size_sd=size_sd,
-        drift_p=drift_p,
-        step_p=step_p,
-        moved=only(timed, np.abs(fit.coefficients[:, TIME]) * span / single),
-        kept=p.keep,
-    )
-
-
-def _last_distance(p: Prepared, design: Array, fit: Regression) -> Array:
-    """(y − ŷ)/sd of the last flight against the line without it: e/√(v(1 − h)) where it is in the fit (deletion
-    formula), e/√(v + xᵀCx) where it was set aside."""
-    last = np.maximum(p.last(p.usable), 0)
-    x = design[last]
-    error = p.y[last] - np.einsum("gp,gp->g", x, fit.coefficients)
-    line = np.einsum("gp,gpq,gq->g", x, fit.covariance, x)
-    v = p.variance[last] + fit.session_variance + fit.flight_variance
-    spread = np.where(p.keep[last], np.maximum(v - line, LEAST_LEFT * v), v + line)
-    return np.asarray(error / np.sqrt(spread))
-
-
-def _latest_step(h: Histories, p: Prepared, design: Array, steps: np.ndarray) -> tuple[Array, Array, Array]:
-    """(time of the first flight, size, sd) of the latest step of each row; NaN without one.
-
-    The size is the mean of two models', with a slope in time and without, by their posterior probability: BIC's
-    approximation to the odds of the slope, times the prior ones (`STEPS_THAT_DRIFT`). Its variance holds the models'
-    disagreement. Hoeting et al. (1999), Statistical Science 14, 382–417.
-    """
-    grouping, g = p.grouping, len(p.unit)
-    latest, found = steps.argmax(axis=1), steps.max(axis=1) >= 0
-    day, size, size_sd = np.full(g, np.nan), np.full(g, np.nan), np.full(g, np.nan)
-    if not found.any():
-        return day, size, size_sd
-    members = np.flatnonzero(found[grouping.row])
-    rows, row = np.unique(grouping.row[members], return_inverse=True)
-    sessions, session = np.unique(grouping.session[members], return_inverse=True)
-    part = Grouping(row, session, np.searchsorted(rows, grouping.row_of_session[sessions]), len(rows))
-    data = p.y[members], p.variance[members], p.keep[members]
-    sloped = fit_random_effects(part, design[members], *data)
-    plain = fit_random_effects(part, np.where(np.arange(design.shape[1]) == TIME, 0.0, design[members]), *data)
-    own, column = np.arange(len(rows)), TIME + 1 + latest[rows]
-    t2 = sloped.coefficients[:, TIME] ** 2 / np.maximum(sloped.covariance[:, TIME, TIME], 1e-300)
-    n, freedom = p.n_sessions[rows], np.maximum(sloped.freedom, 1.0)
-    log_odds = 0.5 * (n * np.log1p(t2 / freedom) - np.log(n)) + special.logit(STEPS_THAT_DRIFT)
-    drifts = np.where(sloped.active[:, TIME], special.expit(log_odds), 0.0)
-    with_slope, without = sloped.coefficients[own, column], plain.coefficients[own, column]
-    mean = drifts * with_slope + (1.0 - drifts) * without
-    variance = (
-        drifts * sloped.covariance[own, column, column]
-        + (1.0 - drifts) * plain.covariance[own, column, column]
-        + drifts * (1.0 - drifts) * (with_slope - without) ** 2
-    )
-    size[rows], size_sd[rows] = p.unit[rows] * mean, p.unit[rows] * np.sqrt(variance)
-    first = np.full(len(grouping.row_of_session), len(h.row))
-    index = np.flatnonzero(p.keep)
-    np.minimum.at(first, grouping.session[index], index)
-    day[rows] = h.time_day[first[steps[rows, latest[rows]]]]
-    return day, size, size_sd

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from fieldcal.drift import REFERENCE_DEGC, Trends
+from fieldcal.drift import Trends
+from fieldcal.drift_evidence import REFERENCE_DEGC
 from fieldcal.fleet import ENOUGH_SIBLINGS, REFERENCE_LEVEL, outliers
 from fieldcal.histories import ENOUGH_SESSIONS, Histories
 from fieldcal.rotation import Array

@@ -203,7 +203,12 @@ PIPELINE: tuple[Stage, ...] = (
     Stage(
         "warm_up",
         warm_up.find_warm_up,
-        {"imu": "ingest.imu", "temperature": "ingest.temperature", **FAULTS},
+        {
+            "imu": "ingest.imu",
+            "temperature": "ingest.temperature",
+            "accelerometer": "accelerometer_pass2.calibration",
+            **FAULTS,
+        },
         ("imu",),
         ("calibration",),
         ("units", "manoeuvre_max_gap_s"),

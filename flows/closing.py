@@ -12,13 +12,18 @@ from typing import Any
 from fieldcal.configuration import Alerts
 from flows.drift_changes import Change, changes, last_usable
 from flows.steps import code_digest
+from schemas import TABLES
+from schemas.arrow import VERSION_KEY
 from warehouse import Warehouse
 from warehouse.checksums import history_digest
+from warehouse.errors import disk
 from warehouse.files import write_bytes
+from warehouse.layout import history_files
 from warehouse.lock import fleet_lock
 from warehouse.sealed import BrokenSeal, seal, unseal
+from warehouse.store import read_facts
 
-INPUTS = ("calibration", "fit", "flight", "sync")
+INPUTS = ("calibration", "fit", "flight", "run", "sync")
 EVENT = "fieldcal.fleet.changed"
 MOST_PAGES = 10
 
@@ -45,6 +50,7 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
     now = datetime.now(UTC)
     with fleet_lock(root):
         before = _remembered(root)
+        _forget_other_versions(root)
         former = Warehouse(root).scan("drift").collect()
         made_from = _made_from(root)
         if before.get("made_from") != made_from or before.get("made") != history_digest(root, ["drift"]):
@@ -80,6 +86,18 @@ def _reports(root: Path, told: Sequence[Change]) -> Path:
 
     vehicles = list(dict.fromkeys(change.vehicle_id for change in told if change.kind not in ("expired", "idle")))
     return write_night_reports(root, vehicles[:MOST_PAGES])[0]
+
+
+def _forget_other_versions(root: Path) -> None:
+    """Remove trends that another release wrote in another form: they follow from the history and are made anew."""
+    for path in history_files(root, "drift"):
+        try:
+            version = read_facts(path).get(VERSION_KEY)
+        except (OSError, ValueError):
+            continue  # damaged, which publishing tells
+        if version != str(TABLES["drift"].version):
+            with disk(path, "removed"):
+                path.unlink()
 
 
 def _made_from(root: Path) -> str:

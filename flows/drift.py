@@ -11,8 +11,11 @@ import polars as pl
 from fieldcal import drift, few_sessions, fleet
 from fieldcal.histories import ENOUGH_SESSIONS, Histories
 from flows.ask import existing
+from flows.drift_curve import Bends, Bent, bends_of, bent
+from flows.drift_memory import Memory
 from flows.drift_reasons import AGREEMENT, VPS, reason
 from flows.drift_warm_up import known_slopes
+from flows.steps import code_digest
 from schemas import TABLES
 from warehouse import Warehouse
 from warehouse.layout import history_files, vehicle_of
@@ -23,6 +26,7 @@ KEY = ["imu_id", "sensor", "method", "parameter", "axis"]
 SIBLINGS = ("sensor", "method", "parameter", "axis", "unit")
 SIGNED = ("scale", "bias", "zero_bias")
 """Parameters whose sign follows the polarity of the axis: siblings may be mounted the other way round."""
+NO_BENDS: Bends = {}
 DAY_US = 86_400_000_000
 ATTEMPTS = 10
 
@@ -30,7 +34,8 @@ ATTEMPTS = 10
 def update_drift(root: Path) -> tuple[str, ...]:
     """Publish the trends of every IMU under the vehicle that carries it now; the vehicles whose table changed.
 
-    A function of the history alone: the same history gives the same bytes, and then nothing is written. When another
+    A function of the history alone: the same history gives the same bytes, and then nothing is written. IMUs whose
+    history did not change are not regressed again (`drift_memory`); the fleet is judged anew from all. When another
     process publishes flights meanwhile, it is done again, so that whoever ends last leaves the trends of all.
 
     Raises
@@ -41,7 +46,9 @@ def update_drift(root: Path) -> tuple[str, ...]:
     changed: set[str] = set()
     for _ in range(ATTEMPTS):
         before = _state(root)
-        table = drift_table(root)
+        memory = Memory(root, code_digest())
+        table = drift_table(root, memory)
+        memory.save()
         for vehicle_id in sorted(set(table["vehicle_id"].to_list()) | _with_drift(root)):
             if publish(root, vehicle_id, {"drift": table.filter(pl.col("vehicle_id") == vehicle_id)}, ()):
                 changed.add(vehicle_id)
@@ -50,16 +57,16 @@ def update_drift(root: Path) -> tuple[str, ...]:
     return tuple(sorted(changed))
 
 
-def drift_table(root: Path) -> pl.DataFrame:
+def drift_table(root: Path, memory: Memory | None = None) -> pl.DataFrame:
     """The table `drift` as the history has it now; nothing is written."""
-    return table_of(history_of_everything(root))
+    return table_of(history_of_everything(root), bends_of(root), memory)
 
 
-def table_of(flights: pl.DataFrame) -> pl.DataFrame:
-    """The table `drift` of `history_of_everything`'s rows."""
+def table_of(flights: pl.DataFrame, bends: Bends = NO_BENDS, memory: Memory | None = None) -> pl.DataFrame:
+    """The table `drift` of `history_of_everything`'s rows and of `bends_of`'s curves."""
     if flights.is_empty():
         return empty_frame("drift")
-    rows, trends, borrowed = trends_of(flights)
+    rows, trends, borrowed = trends_of(flights, bends, memory or Memory())
     group, kind, value, sd = _siblings(rows, trends)
     stepped, drifting = drift.moving(trends)
     fleet_z, fleet_p = fleet.sibling_distance(group, value, sd, doubtful=stepped | drifting, kind=kind)
@@ -137,7 +144,9 @@ def history_of_everything(root: Path) -> pl.DataFrame:
     )
 
 
-def trends_of(flights: pl.DataFrame) -> tuple[pl.DataFrame, drift.Trends, np.ndarray]:
+def trends_of(
+    flights: pl.DataFrame, bends: Bends, memory: Memory
+) -> tuple[pl.DataFrame, drift.Trends, np.ndarray]:
     """(one row a series with what is the same throughout it, its trends, how many siblings lent to it) of
     `history_of_everything`'s rows."""
     numbered = flights.with_columns(row=pl.struct(KEY).rle_id())
@@ -159,9 +168,19 @@ def trends_of(flights: pl.DataFrame) -> tuple[pl.DataFrame, drift.Trends, np.nda
     )
     siblings = rows.select(pl.struct("sensor", "method", "parameter", "unit").rank("dense")).to_series()
     kept = replace(kept, kind=siblings.to_numpy())
-    trends = drift.analyse(kept)
+    imu = rows["imu_id"].rle_id().to_numpy()
+    trends = drift.judge(memory.of(kept, imu), kept.kind)
+    curves = bent(flights, kept, rows, trends, bends)
     if (known := known_slopes(flights, kept, rows, trends)) is not None:
-        trends = drift.analyse(replace(kept, slope_per_degc=known[0], slope_per_degc_sd=known[1]))
+        slope, slope_sd = known
+        if curves is not None:
+            is_bent = np.isfinite(curves.bend).all(axis=1)
+            kept = curves.histories
+            slope, slope_sd = np.where(is_bent, curves.slope, slope), np.where(is_bent, curves.slope_sd, slope_sd)
+        with_slopes = replace(kept, slope_per_degc=slope, slope_per_degc_sd=slope_sd)
+        trends = drift.judge(memory.of(with_slopes, imu), kept.kind)
+        trends = trends if curves is None else curves.widened(trends)
+    rows = _with_curves(rows, curves)
     # A flight set aside is not what the line is as of.
     last = numbered.filter(pl.Series(trends.kept)).group_by("row").agg(as_of=pl.col("started_at").last())
     rows = rows.join(last, on="row", how="left", maintain_order="left")
@@ -169,6 +188,13 @@ def trends_of(flights: pl.DataFrame) -> tuple[pl.DataFrame, drift.Trends, np.nda
     stepped, drifting = drift.moving(trends)
     steady = (trends.n_sessions >= ENOUGH_SESSIONS) & ~stepped & ~drifting
     return rows, *few_sessions.borrow(kept, trends, group, _sign(rows, trends), steady)
+
+
+def _with_curves(rows: pl.DataFrame, curves: Bent | None) -> pl.DataFrame:
+    nothing = np.full((len(rows), 2), np.nan)
+    bend, sd = (nothing, nothing) if curves is None else (curves.bend, curves.bend_sd)
+    columns = {f"curve_per_degc{i + 2}{s}": a[:, i] for i in (0, 1) for s, a in (("", bend), ("_sd", sd))}
+    return rows.with_columns(**{name: pl.Series(column, nan_to_null=True) for name, column in columns.items()})
 
 
 def _sign(rows: pl.DataFrame, trends: drift.Trends) -> np.ndarray:
@@ -208,7 +234,7 @@ def _moments(day: np.ndarray) -> pl.Series:
 
 def _state(root: Path) -> list[tuple[str, int, int, int]]:
     """What the files of the history are; they are replaced whole, so another content is another file."""
-    files = [path for table in ("calibration", "flight", "sync", "fit") for path in history_files(root, table)]
+    files = [path for table in ("calibration", "flight", "run", "sync", "fit") for path in history_files(root, table)]
     return [(str(path), (s := path.stat()).st_ino, s.st_size, s.st_mtime_ns) for path in files]
 
 

@@ -1,4 +1,4 @@
-"""What warm-up flights say of the gyroscope's slope on temperature, brought to the series whose slope it is."""
+"""What warm-up flights say of a zero's slope on temperature, brought to the series whose slope it is."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from fieldcal.drift import Trends, pooled
 from fieldcal.histories import Histories
 from fieldcal.rotation import Array
 from fieldcal.stages.warm_up import METHOD, PARAMETER
+from fieldcal.warm_up import SCALE_PER_DEGC_SD
 
 DISAGREE_SIGMAS = 3.0
 """Flights that warm up and flights at different temperatures are not combined when their slopes are further apart: a
@@ -19,7 +20,8 @@ def known_slopes(flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends
     """(slope per °C, sd), each (g,), of the series `zero` and `zero_bias` from flights that warmed up; NaN elsewhere.
 
     `zero_per_degc` is pooled over flights with its scatter. It is the slope of `zero`; of `zero_bias` = −λ (zero − d0)
-    it is −λ times. None where no flight warmed up.
+    it is −λ times, and the scale's own slope adds λ'/λ zero_bias, of which the usual size is in the sd. None where no
+    flight warmed up.
     """
     own = ((flights["method"] == METHOD) & (flights["parameter"] == PARAMETER)).to_numpy()
     if not own.any():
@@ -44,6 +46,8 @@ def known_slopes(flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends
     )
     slope = (joined["warm"] * joined["factor"]).fill_null(np.nan).to_numpy()
     slope_sd = (joined["warm_sd"] * joined["factor"].abs()).fill_null(np.nan).to_numpy()
+    of_scale = np.where(rows["parameter"] == "zero_bias", SCALE_PER_DEGC_SD * np.abs(trends.value), 0.0)
+    slope_sd = np.hypot(slope_sd, of_scale)
     with np.errstate(invalid="ignore"):
         apart = np.abs(slope - trends.slope_per_degc) > DISAGREE_SIGMAS * np.hypot(slope_sd, trends.slope_per_degc_sd)
     return np.where(apart, np.nan, slope), np.where(apart, np.nan, slope_sd)

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal.constants import SENSORS, Constants, Triad
+from fieldcal.constants import SENSORS, Constants, Triad, cubic_about
 from fieldcal.errors import FieldcalError
 from fieldcal.frames import AXES
 from flows.ask import existing
 
 REFERENCE_DEGC = 25.0
 _QUESTION = """
-SELECT a.*, l.slope_per_degc, l.temperature_min_degc, l.temperature_max_degc
+SELECT a.*, l.slope_per_degc, l.curve_per_degc2, l.curve_per_degc3, l.temperature_min_degc, l.temperature_max_degc
 FROM calibration_at(?) AS a
 JOIN latest_calibration AS l USING (imu_id, sensor, parameter, axis)
 WHERE a.vehicle_id = ? AND a.parameter IN ('scale', 'zero')
@@ -70,6 +70,9 @@ def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
         values = [found[parameter, axis][column] for axis in AXES]
         return np.array([unknown if v is None else v for v in values], dtype=float)
 
+    # The curve about 25 °C, brought to the temperature that is asked for.
+    first, second, third = (vector("zero", c) for c in ("slope_per_degc", "curve_per_degc2", "curve_per_degc3"))
+    slope, square, cube = cubic_about(first, second, third, at - REFERENCE_DEGC)
     sloped = [row for row in found.values() if row["slope_per_degc"] is not None]
     flown = (
         (max(r["temperature_min_degc"] for r in sloped), min(r["temperature_max_degc"] for r in sloped))
@@ -80,7 +83,9 @@ def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
         scale=matrix("value"),
         zero=vector("zero", "value"),
         scale_per_degc=matrix("slope_per_degc"),
-        zero_per_degc=vector("zero", "slope_per_degc"),
+        zero_per_degc=slope,
+        zero_per_degc2=square,
+        zero_per_degc3=cube,
         scale_sd=vector("scale", "sd", np.nan),
         zero_sd=vector("zero", "sd", np.nan),
         unit=_calibrated_unit(found),

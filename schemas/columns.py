@@ -267,6 +267,14 @@ N_FLIGHTS = Column("n_flights", _I64, "1", "flights the regression used")
 VALUE_AT_25DEGC = Column("value_at_25degc", _F64, "named by column unit", "regressed value at 25 degC")
 SLOPE_PER_DEGC = Column("slope_per_degc", _F64, "column unit per degC", "change with temperature")
 SLOPE_PER_DEGC_SD = Column("slope_per_degc_sd", _F64, "column unit per degC", "standard deviation of slope_per_degc")
+CURVE_PER_DEGC2, CURVE_PER_DEGC2_SD, CURVE_PER_DEGC3, CURVE_PER_DEGC3_SD = (
+    Column(f"curve_per_degc{power}{suffix}", _F64, f"column unit per degC^{power}", meaning)
+    for power, word in ((2, "square"), (3, "cube"))
+    for suffix, meaning in (
+        ("", f"coefficient of the {word} of temperature - 25 degC beside slope_per_degc; null: no bend is known"),
+        ("_sd", f"standard deviation of curve_per_degc{power}"),
+    )
+)
 SLOPE_PER_DAY = Column("slope_per_day", _F64, "column unit per day", "change with time")
 SLOPE_PER_DAY_SD = Column("slope_per_day_sd", _F64, "column unit per day", "standard deviation of slope_per_day")
 LAST_Z = Column("last_z", _F64, "1", "distance of the last flight from the regression, in standard deviations")

@@ -7,12 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import polars as pl
+import pyarrow.parquet as pq
 from drift_history import publish_fleet
 from history_rows import START, rows
 
 from fieldcal.configuration import Alerts
 from flows.closing import close_night
 from flows.drift_changes import changes, last_usable
+from schemas.arrow import VERSION_KEY
+from warehouse import Warehouse
+from warehouse.layout import history_files
 
 NOW = START + dt.timedelta(days=100)
 NOBODY = pl.DataFrame(
@@ -77,6 +81,18 @@ def test_age_is_told_when_it_passes_the_limit(tmp_path: Path) -> None:
     )
     assert [c.kind for c in sooner] == ["expired", "expired"]
     assert "it counts for 5 days" in sooner[0].sentence
+
+
+def test_trends_of_another_release_are_made_anew(tmp_path: Path) -> None:
+    publish_fleet(tmp_path, units=2, sessions=6)
+    close_night(tmp_path, Alerts(1e5, 1e5))
+    made = Warehouse(tmp_path).scan("drift").collect()
+    (path, *_) = history_files(tmp_path, "drift")
+    table = pq.read_table(path)
+    other = {**(table.schema.metadata or {}), VERSION_KEY.encode(): b"2"}
+    pq.write_table(table.drop_columns(["best_known_at"]).replace_schema_metadata(other), path)
+    close_night(tmp_path, Alerts(1e5, 1e5))
+    assert Warehouse(tmp_path).scan("drift").collect().equals(made)
 
 
 def test_limits_of_the_configuration_reach_the_night(tmp_path: Path) -> None:

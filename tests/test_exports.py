@@ -35,6 +35,8 @@ def triad(sensor: str, *, soft_iron: bool = False, warm: bool = False, unit_scal
         zero=0.1 * size * RNG.normal(size=3),
         scale_per_degc=1e-4 * RNG.normal(size=(3, 3)) * np.eye(3) if warm else np.zeros((3, 3)),
         zero_per_degc=1e-3 * size * RNG.normal(size=3) if warm else np.zeros(3),
+        zero_per_degc2=2e-5 * size * RNG.normal(size=3) if warm else np.zeros(3),
+        zero_per_degc3=1e-6 * size * RNG.normal(size=3) if warm else np.zeros(3),
         scale_sd=np.full(3, 1e-3),
         zero_sd=np.array([1e-3, np.nan, 1e-3]),
         unit=UNITS[sensor],
@@ -132,11 +134,12 @@ def test_formats_that_hold_everything(form: str, tmp_path: Path) -> None:
             t = document["sensors"][sensor]
             a = {
                 k: np.array(t[k], dtype=float).reshape((3, 3) if "scale" in k else 3)
-                for k in ("scale", "zero", "scale_per_degc", "zero_per_degc")
+                for k in ("scale", "zero", "scale_per_degc", "zero_per_degc", "zero_per_degc2", "zero_per_degc3")
             }
             dt = WARM - t["temperature_degc"]
             scale = a["scale"] + a["scale_per_degc"] * dt
-            found = (raw - a["zero"] - a["zero_per_degc"] * dt) @ scale.T
+            zero = a["zero"] + a["zero_per_degc"] * dt + a["zero_per_degc2"] * dt**2 + a["zero_per_degc3"] * dt**3
+            found = (raw - zero) @ scale.T
             assert (t["unit"], t["raw_unit"]) == (UNITS[sensor], UNITS[sensor])
         assert same(found, wanted)
 

@@ -207,6 +207,18 @@ def test_a_field_of_five_per_cent_is_told(tmp_path: Path, drive: str) -> None:
     assert f"{100 * result['share']:.1f} %" in flight["findings"][0]["sentence"]
 
 
+def test_the_sd_allows_for_a_field_that_was_told(tmp_path: Path) -> None:
+    """A slow current's field is taken for scale: by 4.7 % here, which no residual shows."""
+    truth = Experiment(seed=21).scale["magnetometer"]
+    document = calibrate_log(flown(tmp_path, 0.05, "current_a"))
+    rows = [row for row in document["calibration"] if row["sensor"] == "magnetometer" and row["parameter"] == "scale"]
+    assert {row["status"] for row in rows} == {"ok"}
+    found, sd = (np.array([row[column] for row in rows]) for column in ("value", "sd"))
+    assert np.abs((found - truth) / sd).max() < 2.0
+    assert np.abs(found / truth - 1.0).max() > 0.02
+    assert np.abs(sd / truth).max() == pytest.approx(0.05, abs=0.015)
+
+
 def expected_slope(share: float, span: float) -> np.ndarray:
     return np.asarray(share * SLOPE_UT_PER_A / np.linalg.norm(SLOPE_UT_PER_A) / span)
 

@@ -353,6 +353,7 @@ NOON = dt.datetime(2026, 5, 11, 12, tzinfo=dt.UTC)
 
 def test_band_is_the_regressions_own_standard_deviation() -> None:
     row = {"value_at_25degc": 2.0, "sd": 0.3, "slope_per_degc": 0.1, "slope_per_degc_sd": 0.02, "best_known_degc": None}
+    row |= {"curve_per_degc2": None, "curve_per_degc3": None}
     row |= {"slope_per_day": -0.5, "slope_per_day_sd": 0.4, "best_known_at": None, "as_of": NOON}
     value, sd = predicted(row, 35.0, -1.0)
     assert value == pytest.approx(2.0 + 1.0 + 0.5)

@@ -6,19 +6,21 @@ Conventions (ArduPilot, libraries/AP_InertialSensor and AP_Compass): in sensor a
     gyroscope      raw − thermal − INS_GYROFFS, rad/s; there is no scale
     compass        M (raw + COMPASS_OFS), milligauss; M symmetric: COMPASS_DIA on the diagonal, COMPASS_ODI_X = M_xy,
                    _Y = M_xz, _Z = M_yz. **The offset is added: it has the opposite sign of fieldcal's zero**
-    thermal        1e-6 · INS_TCAL1_ACC1 (T − INS_ACC1_CALTEMP), both kept within INS_TCAL1_TMIN … TMAX, which must be
-                   at least 10 °C apart (gyroscope: INS_TCAL1_GYR1, INS_GYR1_CALTEMP)
+    thermal        p(T) − p(INS_ACC1_CALTEMP), p(T) = 1e-6 (INS_TCAL1_ACC1 d + _ACC2 d² + _ACC3 d³), d = T − 35 °C, both
+                   temperatures kept within INS_TCAL1_TMIN … TMAX, which must be at least 10 °C apart (gyroscope:
+                   INS_TCAL1_GYR1, INS_GYR1_CALTEMP)
 
 The first instance of each sensor is written; ArduPilot keeps parameters as float32.
 """
 
 from __future__ import annotations
 
-from fieldcal.constants import Constants, Export
+from fieldcal.constants import Constants, Export, cubic_about
 from fieldcal.exports.autopilot import in_autopilot_units, not_held, symmetric, thermal
 
 MILLIGAUSS = 1e-3
 COEFFICIENT = 1e6
+TEMPERATURE_REFERENCE_DEGC = 35.0
 LEAST_SPAN_DEGC = 10.0
 AXES = "XYZ"
 
@@ -51,9 +53,11 @@ def ardupilot(constants: Constants) -> Export:
             rows += [("INS_TCAL1_ENABLE", 1), ("INS_TCAL1_TMIN", low), ("INS_TCAL1_TMAX", high)]
             for short, triad, _, _ in warm:
                 rows.append((f"INS_{short}1_CALTEMP", triad.temperature_degc))
+                about_t0 = triad.zero_per_degc, triad.zero_per_degc2, triad.zero_per_degc3
+                cubic = cubic_about(*about_t0, TEMPERATURE_REFERENCE_DEGC - triad.temperature_degc)
                 for i, axis in enumerate(AXES):
-                    rows.append((f"INS_TCAL1_{short}1_{axis}", COEFFICIENT * float(triad.zero_per_degc[i])))
-                    rows += [(f"INS_TCAL1_{short}{order}_{axis}", 0.0) for order in (2, 3)]
+                    for order, coefficient in enumerate(cubic, start=1):
+                        rows.append((f"INS_TCAL1_{short}{order}_{axis}", COEFFICIENT * float(coefficient[i])))
     if (triad := triads.get("magnetometer")) is not None:
         matrix, asymmetric = symmetric(triad, "ArduPilot")
         warnings += asymmetric

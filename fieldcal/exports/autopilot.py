@@ -1,4 +1,4 @@
-"""What PX4's and ArduPilot's parameters have in common: sensors in fixed units, positive scales, one temperature slope.
+"""What PX4's and ArduPilot's parameters have in common: sensors in fixed units, positive scales, a cubic over °C.
 
 Both correct raw readings as their drivers give them, in the sensor's own axes, before rotation to the board:
 accelerometer (raw − offset) · scale in m/s², gyroscope raw − offset in rad/s without a scale, magnetometer by a
@@ -44,6 +44,8 @@ def in_autopilot_units(constants: Constants, magnetic_unit: float) -> tuple[dict
             scale_per_degc=triad.scale_per_degc * calibrated / logged,
             zero=triad.zero * logged,
             zero_per_degc=triad.zero_per_degc * logged,
+            zero_per_degc2=triad.zero_per_degc2 * logged,
+            zero_per_degc3=triad.zero_per_degc3 * logged,
         )
         if np.any(np.diagonal(own.scale) <= 0.0):
             warnings.append(
@@ -89,5 +91,7 @@ def symmetric(triad: Triad, target: str) -> tuple[np.ndarray, list[str]]:
 
 
 def thermal(triad: Triad) -> bool:
-    """Whether there is a slope of the zero to export."""
-    return triad.flown_degc is not None and bool(np.any(triad.zero_per_degc != 0.0))
+    """Whether there is a slope or bend of the zero to export."""
+    return triad.flown_degc is not None and any(
+        bool(np.any(part != 0.0)) for part in (triad.zero_per_degc, triad.zero_per_degc2, triad.zero_per_degc3)
+    )

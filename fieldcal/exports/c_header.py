@@ -9,7 +9,8 @@ import numpy as np
 from fieldcal.constants import SENSORS, Constants, Export
 
 APPLY = """\
-/* out = S (raw - Z) at temperature_degc; S = scale + scale_per_degc (T - T0), Z = zero + zero_per_degc (T - T0). */
+/* out = S (raw - Z) at temperature_degc; d = T - T0: S = scale + scale_per_degc d, Z = zero + zero_per_degc d
+   + zero_per_degc2 d^2 + zero_per_degc3 d^3. */
 static inline void fieldcal_apply(const fieldcal_triad *c, const double raw[3], double temperature_degc, double out[3])
 {
     const double warmer = temperature_degc - c->temperature_degc;
@@ -17,7 +18,8 @@ static inline void fieldcal_apply(const fieldcal_triad *c, const double raw[3], 
         out[i] = 0.0;
         for (int j = 0; j < 3; j++) {
             const double scale = c->scale[i][j] + warmer * c->scale_per_degc[i][j];
-            out[i] += scale * (raw[j] - c->zero[j] - warmer * c->zero_per_degc[j]);
+            const double bend = c->zero_per_degc2[j] + warmer * c->zero_per_degc3[j];
+            out[i] += scale * (raw[j] - c->zero[j] - warmer * (c->zero_per_degc[j] + warmer * bend));
         }
     }
 }
@@ -38,6 +40,8 @@ def c_header(constants: Constants) -> Export:
         "    double zero[3];",
         "    double scale_per_degc[3][3];",
         "    double zero_per_degc[3];",
+        "    double zero_per_degc2[3];",
+        "    double zero_per_degc3[3];",
         "} fieldcal_triad;",
         "",
     ]
@@ -52,6 +56,8 @@ def c_header(constants: Constants) -> Export:
             f"    {_array(triad.zero)},",
             f"    {_array(triad.scale_per_degc)},",
             f"    {_array(triad.zero_per_degc)},",
+            f"    {_array(triad.zero_per_degc2)},",
+            f"    {_array(triad.zero_per_degc3)},",
             "};",
             "",
         ]

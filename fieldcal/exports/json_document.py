@@ -10,8 +10,8 @@ import numpy as np
 from fieldcal.constants import SENSORS, Constants, Export, Triad
 
 MODEL = (
-    "calibrated = S (raw - Z); S = scale + scale_per_degc (T - temperature_degc), Z = zero + zero_per_degc"
-    " (T - temperature_degc); sensor axes as logged"
+    "calibrated = S (raw - Z), d = T - temperature_degc; S = scale + scale_per_degc d, Z = zero + zero_per_degc d"
+    " + zero_per_degc2 d^2 + zero_per_degc3 d^3; sensor axes as logged"
 )
 
 
@@ -28,7 +28,8 @@ def json_document(constants: Constants) -> Export:
 
 
 def _triad(triad: Triad) -> dict[str, Any]:
-    arrays = ("scale", "zero", "scale_per_degc", "zero_per_degc", "scale_sd", "zero_sd")
+    slopes = ("scale_per_degc", "zero_per_degc", "zero_per_degc2", "zero_per_degc3")
+    arrays = ("scale", "zero", *slopes, "scale_sd", "zero_sd")
     return {
         "unit": triad.unit,
         "raw_unit": triad.logged_unit,

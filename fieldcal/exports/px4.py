@@ -42,7 +42,7 @@ def px4(constants: Constants) -> Export:
                 (f"TC_{letter}0_TMAX", max(high, triad.temperature_degc), REAL32),
             ]
             for i in range(3):
-                slopes = (0.0, triad.zero_per_degc[i], 0.0, 0.0)
+                slopes = (0.0, triad.zero_per_degc[i], triad.zero_per_degc2[i], triad.zero_per_degc3[i])
                 rows += [(f"TC_{letter}0_X{order}_{i}", slope, REAL32) for order, slope in enumerate(slopes)]
             warnings.append(
                 f"{sensor}: TC_{letter}0_ID must be the device id of this sensor, as CAL_{name}0_ID is, or PX4 ignores"

@@ -22,7 +22,7 @@ def ros(constants: Constants) -> Export:
     """A ROS 2 parameter file for any node (`/**`)."""
     lines = [
         "# calibrated = S (raw - zero); S = scale + scale_per_degc (T - temperature_degc), 3 x 3 row by row;",
-        "# zero = zero + zero_per_degc (T - temperature_degc); sensor axes as logged",
+        "# zero likewise, + zero_per_degc2 (T - ...)^2 + zero_per_degc3 (T - ...)^3; sensor axes as logged",
         "/**:",
         "  ros__parameters:",
         "    fieldcal:",
@@ -42,6 +42,8 @@ def ros(constants: Constants) -> Export:
             f"        zero: {_list(triad.zero)}",
             f"        scale_per_degc: {_list(triad.scale_per_degc.ravel())}",
             f"        zero_per_degc: {_list(triad.zero_per_degc)}",
+            f"        zero_per_degc2: {_list(triad.zero_per_degc2)}",
+            f"        zero_per_degc3: {_list(triad.zero_per_degc3)}",
             f"        scale_sd: {_list(triad.scale_sd)}",
             f"        zero_sd: {_list(triad.zero_sd)}",
         ]

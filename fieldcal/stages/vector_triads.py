@@ -210,6 +210,21 @@ def _lever_arm(samples: pl.DataFrame, rate: Array, s: Settings) -> Array:
     return sensor.lever_arm_acceleration(rate, rate_dot, s["lever_arm_m"])
 
 
+def _with_motor_field(rows: pl.DataFrame, share: float, strength: float) -> pl.DataFrame:
+    """Magnetometer rows whose sd allows for a field of `share` times the local one that follows the motors' current: a
+    constant ellipsoid may take all of it for scale or for bias, and its residual need not show it."""
+    of_axis = rows.filter(pl.col("parameter") == "scale").select("method", "axis", scale=pl.col("value").abs())
+    could_err = (
+        pl.when(pl.col("parameter") == "scale")
+        .then(share * pl.col("scale"))
+        .when(pl.col("parameter") == "zero")
+        .then(share * strength / pl.col("scale"))
+        .otherwise(share * strength)
+    )
+    joined = rows.join(of_axis, on=["method", "axis"], how="left", maintain_order="left")
+    return joined.with_columns(sd=(pl.col("sd") ** 2 + could_err**2).sqrt()).select(rows.columns)
+
+
 def judge_vectors(tables: Tables, s: Settings) -> StageResult:
     """Both vector triads' calibrations and what the attitude and the motors' current say of them → calibration, faults.
 
@@ -227,6 +242,9 @@ def judge_vectors(tables: Tables, s: Settings) -> StageResult:
         if fault is not None:
             code = pl.when(pl.col("status") == "ok").then(pl.lit(fault["reason_code"])).otherwise("reason_code")
             parts.append(tables[name].with_columns(status=pl.lit("refused"), reason_code=code))
+        elif name == "magnetometer" and motor_faults and "motor_field" in measured:
+            share = float(measured["motor_field"]["share"])
+            parts.append(_with_motor_field(tables[name], share, float(np.linalg.norm(s["field_ned"]))))
         else:
             parts.append(tables[name])
     if not parts:

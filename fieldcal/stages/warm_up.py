@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from fieldcal import warm_up
 from fieldcal.errors import UnusableFlight
-from fieldcal.frames import AXES, calibration_rows, matrix, seconds, triad
-from fieldcal.results import StageResult
+from fieldcal.frames import AXES, calibration_rows, constants, matrix, seconds, triad
+from fieldcal.results import StageResult, fatal_fault
+from fieldcal.rotation import Array
 from fieldcal.stages.inputs import Settings, Tables
 
 METHOD, PARAMETER = "warm_up", "zero_per_degc"
+CURVE = "zero_over_temperature"
+"""What stands in `measured`: the zero as a cubic of temperature, level left out, an axis a row."""
 
 
 def find_warm_up(tables: Tables, s: Settings) -> StageResult:
-    """imu, temperature → calibration: slope of the gyroscope's zero, where the IMU rested while it warmed up."""
+    """imu, temperature → calibration: slope of the gyroscope's zero, and of the accelerometer's as far as it shows,
+    where the IMU rested while it warmed up."""
     imu, temperature = tables["imu"], tables.get("temperature")
     logged = matrix(imu, triad("gyroscope"))
     if temperature is None or (temperature := temperature.drop_nulls()).is_empty() or np.isnan(logged).any():
@@ -27,10 +33,28 @@ def find_warm_up(tables: Tables, s: Settings) -> StageResult:
         return StageResult(
             status="absent", reason_code=error.reason_code, reason=error.sentence, measured=error.measured
         )
-    unit = s["units"]["gyroscope"]
-    rows = [
+    rows = _rows("gyroscope", found, s)
+    resting = _resting(tables, s, t, logged, warm)
+    if resting is not None:
+        rows += _rows("accelerometer", resting, s)
+    measured = {"rest_windows": found.n_windows, "span_degc": found.span_degc, "zero": found.zero.tolist()}
+    if found.bend is not None and found.bend_covariance is not None:
+        measured |= {
+            CURVE: {
+                "centre_degc": found.temperature_degc,
+                "width_degc": found.width_degc,
+                "coefficients": found.bend.tolist(),
+                "covariance": found.bend_covariance.tolist(),
+            }
+        }
+    return StageResult({"calibration": calibration_rows(rows)}, measured=measured)
+
+
+def _rows(sensor: str, found: warm_up.WarmUp, s: Settings) -> list[dict[str, Any]]:
+    unit = s["units"][sensor]
+    return [
         {
-            "sensor": "gyroscope",
+            "sensor": sensor,
             "method": METHOD,
             "parameter": PARAMETER,
             "axis": axis,
@@ -43,5 +67,19 @@ def find_warm_up(tables: Tables, s: Settings) -> StageResult:
         }
         for i, axis in enumerate(AXES)
     ]
-    measured = {"rest_windows": found.n_windows, "span_degc": found.span_degc, "zero": found.zero.tolist()}
-    return StageResult({"calibration": calibration_rows(rows)}, measured=measured)
+
+
+def _resting(tables: Tables, s: Settings, t: Array, rate: Array, warm: Array) -> warm_up.WarmUp | None:
+    """The accelerometer at rest; None without readings that can be trusted, constants, or such a rest."""
+    known = constants(tables["accelerometer"], "accelerometer") if "accelerometer" in tables else None
+    if known is None or ("faults" in tables and fatal_fault(tables["faults"], ("accelerometer",)) is not None):
+        return None
+    scale, bias = known
+    logged = matrix(tables["imu"], triad("accelerometer"))
+    if np.isnan(logged).any():
+        return None
+    gravity = logged + np.linalg.solve(scale, bias)
+    try:
+        return warm_up.fit_resting_accelerometer(t, rate, logged, warm, gravity, max_gap_s=s["manoeuvre_max_gap_s"])
+    except UnusableFlight:
+        return None

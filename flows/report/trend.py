@@ -41,6 +41,13 @@ def change_sentence(row: Mapping[str, Any], siblings: Sequence[float]) -> str:
     return "–" if slope == "–" else f"{with_unit(slope, row['unit'])} per day."
 
 
+def warmed(row: Mapping[str, Any], degc: Array | float) -> Array:
+    """What a drift row's regression adds to the value at 25 °C at another temperature."""
+    d = np.asarray(degc, dtype=float) - REFERENCE_DEGC
+    first, second, third = (row[c] or 0.0 for c in ("slope_per_degc", "curve_per_degc2", "curve_per_degc3"))
+    return np.asarray(first * d + second * d**2 + third * d**3)
+
+
 def predicted(row: Mapping[str, Any], degc: Array | float, days: Array | float) -> tuple[Array, Array]:
     """Value and standard deviation of a drift row's regression at a temperature, so many days after its moment.
 
@@ -50,9 +57,9 @@ def predicted(row: Mapping[str, Any], degc: Array | float, days: Array | float) 
     once, the covariance of the two slopes is missing: ask along one of them.
     """
     degc, later = np.asarray(degc, dtype=float), np.asarray(days, dtype=float)
-    slope, slope_sd = row["slope_per_degc"] or 0.0, row["slope_per_degc_sd"] or 0.0
+    slope_sd = row["slope_per_degc_sd"] or 0.0
     best = REFERENCE_DEGC if row["best_known_degc"] is None else row["best_known_degc"]
-    value = row["value_at_25degc"] + slope * (degc - REFERENCE_DEGC) + (row["slope_per_day"] or 0.0) * later
+    value = row["value_at_25degc"] + warmed(row, degc) + (row["slope_per_day"] or 0.0) * later
     at_temperature = (row["sd"] or 0.0) ** 2 + slope_sd**2 * ((degc - best) ** 2 - (REFERENCE_DEGC - best) ** 2)
     best_day = 0.0 if row["best_known_at"] is None else days_after([row["best_known_at"]], row["as_of"])[0]
     in_time = (row["slope_per_day_sd"] or 0.0) ** 2 * ((later - best_day) ** 2 - best_day**2)

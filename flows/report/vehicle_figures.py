@@ -12,7 +12,7 @@ import polars as pl
 from fieldcal.rotation import Array
 from flows.report.page import Plot
 from flows.report.plot import INK, XYZ, headed, legend_below, panels, svg
-from flows.report.trend import REFERENCE_DEGC, days_after, predicted
+from flows.report.trend import REFERENCE_DEGC, days_after, predicted, warmed
 from flows.report.words import count, day, unit
 
 MOST_POINTS = 250
@@ -82,7 +82,7 @@ def _panel_row(axes: Any, rows: pl.DataFrame, trend: Mapping[str, Any] | None, v
     at_25, at_last, changed = value, value, None
     before = np.zeros(len(value), dtype=bool)
     if trend is not None:
-        at_25 = value - np.nan_to_num((trend["slope_per_degc"] or 0.0) * (degc - REFERENCE_DEGC))
+        at_25 = value - np.nan_to_num(warmed(trend, degc))
         at_last = value - np.nan_to_num((trend["slope_per_day"] or 0.0) * days)
         changed = trend["change_at"]
     if changed is not None:

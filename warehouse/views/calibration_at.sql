@@ -1,9 +1,11 @@
 -- What to fly with at a temperature: SELECT * FROM calibration_at(12.5). sd is that of the value; the next power-up
--- scatters about it by session_sd.
+-- scatters about it by session_sd. A bend over temperature (curve_per_degc2, _degc3) is in the value, its sd is not.
 CREATE MACRO calibration_at(temperature_degc) AS TABLE
 SELECT
     l.vehicle_id, l.imu_id, l.sensor, l.method, l.parameter, l.axis,
-    l.value_at_25degc + coalesce(l.slope_per_degc, 0) * (temperature_degc - 25) AS value,
+    l.value_at_25degc + coalesce(l.slope_per_degc, 0) * (temperature_degc - 25)
+    + coalesce(l.curve_per_degc2, 0) * (temperature_degc - 25) ^ 2
+    + coalesce(l.curve_per_degc3, 0) * (temperature_degc - 25) ^ 3 AS value,
     sqrt(
         greatest(
             l.sd ^ 2 + coalesce(l.slope_per_degc_sd, 0) ^ 2

@@ -27,7 +27,11 @@ beside AS (
     SELECT
         k.imu_id, k.sensor, k.parameter, k.axis, l, d,
         d.value_at_25degc IS NOT NULL AND (d.status <> 'insufficient' OR d.borrowed_from IS NOT NULL) AS trend,
-        coalesce(d.slope_per_degc * (l.at_degc - 25), 0) AS warmer,
+        coalesce(
+            d.slope_per_degc * (l.at_degc - 25) + coalesce(d.curve_per_degc2, 0) * (l.at_degc - 25) ^ 2
+            + coalesce(d.curve_per_degc3, 0) * (l.at_degc - 25) ^ 3,
+            0
+        ) AS warmer,
         coalesce(d.slope_per_degc_sd, 0) AS slope_sd,
         coalesce(d.best_known_degc, 25) AS best
     FROM latest AS k
@@ -64,6 +68,8 @@ SELECT
     END AS sd,
     CASE WHEN trend THEN d.slope_per_degc END AS slope_per_degc,
     CASE WHEN trend THEN d.slope_per_degc_sd END AS slope_per_degc_sd,
+    CASE WHEN trend THEN d.curve_per_degc2 END AS curve_per_degc2,
+    CASE WHEN trend THEN d.curve_per_degc3 END AS curve_per_degc3,
     l.unit, l.at_degc AS temperature_degc, l.flight_id, l.started_at,
     CASE WHEN by_trend THEN 'drift' ELSE 'flight' END AS source,
     CASE WHEN by_trend THEN d.best_known_degc ELSE l.at_degc END AS best_known_degc,
