@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from fieldcal.errors import EstimationError
 from fieldcal.joint_chain import (
@@ -160,7 +161,9 @@ def _enlarged(fit: JointFit, response: Array) -> JointFit:
     """With the covariance that coloured residuals leave; `response` (K, s, p) of the knots to the parameters."""
     chunks = sensitivities(fit.model, fit.state, fit.path, fit.layout, len(fit.information))
     whitening = _whitening(fit.weight, fit.levels)
-    return replace(fit, covariance=covariance(fit.model, chunks, response, fit.information, whitening))
+    knots = fit.model.knots
+    jumps = fit.path.jump, np.sqrt(knots.joined / (fit.levels.walk * knots.interval_s))
+    return replace(fit, covariance=covariance(fit.model, chunks, response, fit.information, whitening, jumps))
 
 
 def _iterate(
@@ -330,11 +333,15 @@ def _robust_weight(model: Model, residual: Array, levels: Levels) -> Array:
     """Redescending weights (m, r): 1 up to CLIP standard deviations of the reading, (CLIP/d)⁴ beyond, 0 for none.
 
     With the square alone a wrong reading adds CLIP² to its variance, however far off, and six in a hundred of them
-    inflate that until none is an outlier."""
+    inflate that until none is an outlier. What d is of a reading alone or of the mean over its interval's length, which
+    shows the edges of a burst."""
     out = np.empty_like(residual)
+    together = max(1, len(residual) // len(model.knots.index))
     for i, name in enumerate(model.rows):
         row = slice(3 * i, 3 * i + 3)
         square = np.sum(residual[:, row] ** 2 / levels.variance[row], axis=1)
+        mean = uniform_filter1d(residual[:, row], together, axis=0)
+        square = np.maximum(square, np.sum(mean**2 * together / (levels.variance * levels.colour)[row], axis=1))
         weight = np.minimum(1.0, CLIP**2 / np.maximum(square, 1e-12)) ** 2 * model.triads[name].known
         out[:, row] = weight[:, None]
     return out
