@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from fieldcal.errors import EstimationError
 from fieldcal.joint_chain import (
@@ -182,7 +183,9 @@ def _enlarged(fit: JointFit, response: Array) -> JointFit:
     chunks = sensitivities(fit.model, fit.state, fit.path, fit.layout, len(fit.information))
     whitening = _whitening(fit.weight, fit.levels)
     poses = None if fit.vps is None else fit.vps.whitened(fit.model, fit.state, fit.path, fit.layout, response)
-    return replace(fit, covariance=covariance(fit.model, chunks, response, fit.information, whitening, poses))
+    knots = fit.model.knots
+    jumps = fit.path.jump, np.sqrt(knots.joined / (fit.levels.walk * knots.interval_s))
+    return replace(fit, covariance=covariance(fit.model, chunks, response, fit.information, whitening, jumps, poses))
 
 
 def _iterate(
@@ -370,11 +373,16 @@ def robust_weight(model: Model, residual: Array, levels: Levels) -> Array:
     """Redescending weights (m, r): 1 up to CLIP standard deviations of the reading, (CLIP/d)⁴ beyond, 0 for none.
 
     With the square alone a wrong reading adds CLIP² to its variance, however far off, and six in a hundred of them
-    inflate that until none is an outlier."""
+    inflate that until none is an outlier. A magnetometer's d is of the reading alone or of the mean over an interval,
+    which shows the edges of a burst; what an accelerometer has in common over one is translation."""
     out = np.empty_like(residual)
+    together = max(1, len(residual) // len(model.knots.index))
     for i, name in enumerate(model.rows):
         row = slice(3 * i, 3 * i + 3)
         square = np.sum(residual[:, row] ** 2 / levels.variance[row], axis=1)
+        if name == "magnetometer":
+            mean = uniform_filter1d(residual[:, row], together, axis=0)
+            square = np.maximum(square, np.sum(mean**2 * together / (levels.variance * levels.colour)[row], axis=1))
         weight = np.minimum(1.0, CLIP**2 / np.maximum(square, 1e-12)) ** 2 * model.triads[name].known
         out[:, row] = weight[:, None]
     return out

@@ -18,6 +18,7 @@ def covariance(
     response: Array,
     information: Array,
     whitening: Array,
+    jumps: tuple[Array, Array],
     others: tuple[Array, Array] | None = None,
 ) -> Array:
     """Covariance (p, p) of θ: the inverse information, enlarged where the sensors' residuals are coloured.
@@ -36,26 +37,32 @@ def covariance(
         Of θ, knots eliminated.
     whitening : (m, r) array
         Weights over low-frequency variance.
+    jumps : (K−1, 3), (K−1,) arrays
+        Of the attitude at the joints and 1/their sd: coloured where the gyroscope's bias drifts.
     others : (K, c, p), (K, c) arrays, optional
         Whitened sensitivities, knots eliminated, and residuals of what else was measured at the knots.
     """
     inverse = inverse_information(information)
     k, r, p = len(response), whitening.shape[1], len(information)
-    sensitivity, residual, count = np.zeros((k, r, p)), np.zeros((k, r)), np.zeros((k, r))
-    for ties, rows, _ in chunks:
+    sensitivity, residual, count = np.zeros((k, r + 3, p)), np.zeros((k, r + 3)), np.zeros((k, r + 3))
+    residual[:-1, r:], count[:-1, r:] = jumps[0] * jumps[1][:, None], 1.0
+    sensitivity[:-1, r:] = np.diff(response[:, :3], axis=0)
+    for ties, rows, ends in chunks:
         at = model.at[rows.own]
         knot, share = model.knots.of_sample[at], model.knots.share[at, None, None]
         after = np.minimum(knot + 1, k - 1)
         between = (1.0 - share) * response[knot][:, SENSED] + share * response[after][:, SENSED]
         root = np.sqrt(whitening[rows.own])
         own = (rows.by_parameter - rows.by_knot @ between) * root[..., None]
-        sensitivity[ties] = sums_by_interval(model, own.reshape(len(at), -1), rows.own, ties).reshape(-1, r, p)
-        residual[ties] = sums_by_interval(model, rows.residual * root, rows.own, ties)
-        count[ties] = sums_by_interval(model, (root > 0).astype(float), rows.own, ties)
+        sensitivity[ties, :r] = sums_by_interval(model, own.reshape(len(at), -1), rows.own, ties).reshape(-1, r, p)
+        sensitivity[ties, r:] += ends
+        residual[ties, :r] = sums_by_interval(model, rows.residual * root, rows.own, ties)
+        count[ties, :r] = sums_by_interval(model, (root > 0).astype(float), rows.own, ties)
+    sensitivity[:-1, r:] *= jumps[1][:, None, None]
     scale = 1.0 / np.sqrt(np.maximum(count, 1.0))
     sensitivity, residual = sensitivity * scale[..., None], residual * scale
     excess = np.zeros((p, p))
-    for row in range(r):
+    for row in range(r + 3):
         s, e = sensitivity[:, row], residual[:, row]
         variance = float(np.mean(e**2))
         if variance > 0.0:
