@@ -109,9 +109,7 @@ class State:
         values = dict(self.values)
         for name, own in layout.items():
             values[name] = values[name] + theta[own]
-        return State(
-            multiply(from_rotation_vector(knots[:, :3]), self.q), self.motion + knots[:, 3:], values
-        )
+        return State(multiply(from_rotation_vector(knots[:, :3]), self.q), self.motion + knots[:, 3:], values)
 
 
 @dataclass(frozen=True)
@@ -369,8 +367,7 @@ def accumulate(
                 normal.diagonal[knot, state, other] += product[here, part, columns][:, own_part]
     for state, own_part in BLOCKS:
         for other, other_part in BLOCKS:
-            rows_after = slice(6 + own_part.start, 6 + own_part.stop)
-            normal.below[ties.start : last, state, other] += product[inside, rows_after, other_part]
+            normal.below[ties.start : last, state, other] += product[inside, 6:, other_part][:, own_part]
 
 
 def _padded(model: Model, own: slice, ties: slice) -> np.ndarray:
@@ -393,12 +390,8 @@ def sums_by_interval(model: Model, x: Array, own: slice, ties: slice) -> Array:
 def layout_of(model: Model, *, dip: bool, lever_arm: bool) -> tuple[dict[str, slice], int]:
     """Where each free parameter stands in θ, and how many there are."""
     layout, at = {}, 0
-    free = ["gyroscope", *model.rows]
-    if dip and len(model.rows) == 2:
-        free.append("dip")
-    if lever_arm and "accelerometer" in model.rows:
-        free.append("lever_arm")
-    for name in free:
+    optional = {"dip": dip and len(model.rows) == 2, "lever_arm": lever_arm and "accelerometer" in model.rows}
+    for name in ["gyroscope", *model.rows, *(name for name, free in optional.items() if free)]:
         size = {"dip": 1, "lever_arm": 3}.get(name, 6)
         layout[name] = slice(at, at + size)
         at += size
