@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from fieldcal import joint_start
 from fieldcal.errors import UnusableFlight
@@ -19,8 +20,11 @@ LEVER_ARM_M = (0.05, 0.02, -0.03)
 MOVING = {"translation_rms_mps2": 0.3, "lever_arm_m": LEVER_ARM_M}
 # The rate is taken as linear between samples, readings are averaged over three of them, turns bend the truth in both.
 DISCRETISATION = 5e-4
-# Gyroscope noise in the low-passed rates draws the arm towards zero: a third of its length at the worst.
-LEVER_ARM_ERROR_M = 0.02
+# Scales with translation and an unknown lever arm, rms of three axes, median over flights; attitude likewise.
+BARS = {"magnetometer": 0.006, "accelerometer": 0.016, "gyroscope": 0.0085}
+ATTITUDE_DEG = 0.9
+# Error ÷ sd that one of nine scales on each of six flights passes by chance once in a hundred (normal, Bonferroni).
+FARTHEST = 3.9
 SEEDS = (11, 12, 13, 14, 15, 16)
 
 
@@ -93,15 +97,27 @@ def moving() -> list[tuple[Recording, JointFit]]:
 
 def test_translation_and_an_unknown_lever_arm_cost_little(moving: list[tuple[Recording, JointFit]]) -> None:
     """The serial chain refuses or misses these by tens of per cent. Medians; `benchmarks/joint_accuracy.py` has 32."""
-    for name, bar in (("magnetometer", 0.009), ("accelerometer", 0.016), ("gyroscope", 0.011)):
+    for name, bar in BARS.items():
         assert np.median([rms(relative_errors(r, fit, name)) for r, fit in moving]) < bar, name
-    assert np.median([np.degrees(rms(angle_between(fit.path.q, r.q))) for r, fit in moving]) < 0.9
+    assert np.median([np.degrees(rms(angle_between(fit.path.q, r.q))) for r, fit in moving]) < ATTITUDE_DEG
     for _, fit in moving:
-        assert np.abs(fit.state.values["lever_arm"] - LEVER_ARM_M).max() < LEVER_ARM_ERROR_M
+        assert "lever_arm" in fit.layout
+
+
+def test_scales_and_lever_arm_are_not_drawn_towards_nothing(moving: list[tuple[Recording, JointFit]]) -> None:
+    """Noise in a regressor shrinks what stands beside it, the same way on every flight: the mean normalised error of a
+    triad's scales over flights would show it. Wrongly formed gradients (`_logged_units`, `_within_intervals`,
+    `_integrated_translation`) are off by several times this."""
+    errors = np.array([normalised_errors(r, fit) for r, fit in moving])
+    assert np.abs(errors).max() < FARTHEST
+    assert np.abs(errors.mean(axis=0)).max() < FARTHEST / np.sqrt(len(moving))
 
 
 def test_claimed_standard_deviations_are_honest(moving: list[tuple[Recording, JointFit]]) -> None:
-    assert 0.4 < np.median([np.mean(normalised_errors(r, fit) ** 2) for r, fit in moving]) < 1.6
+    """The nine errors of a flight move together: as good as one degree of freedom each, so that the mean of six flights
+    is χ²₆/6, within its 0.5 % and 99.5 % points. `benchmarks/joint_accuracy.py` has the median of 32."""
+    low, high = chi2.ppf([0.005, 0.995], len(moving)) / len(moving)
+    assert low < np.mean([np.mean(normalised_errors(r, fit) ** 2) for r, fit in moving]) < high
 
 
 def test_clean_flights_keep_no_lever_arm_and_honest_sd() -> None:
