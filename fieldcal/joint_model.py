@@ -263,7 +263,6 @@ def accumulate(
     total = flat.T @ flat
     bridge = given[..., p + 1 :].sum(axis=2)
     signs = probe.sensors[rows.own] * (root > 0)
-    alone = np.stack([signs, bridge], axis=2)[:, :, None, :]
     normal.parameters += total[:p, :p]
     normal.parameters_right[:, GRADIENT] += total[:p, p]
     own = (flat[:, :p].reshape(m, r, p) * signs[..., None]).sum(axis=0).T
@@ -271,9 +270,10 @@ def accumulate(
     normal.parameters_right[:, BRIDGE] += total[:p, p + 1 :].sum(axis=1)
     groups[1][:p, :r] += own
     groups[1][p, r:] += np.r_[total[p + 1 :, p + 1 :].sum(axis=1), np.sum(bridge**2, axis=0)]
-    pulled = sums_by_interval(model, (met[:m, :, :12, None] * alone).reshape(m, -1), rows.own, ties)
-    pulled = pulled.reshape(-1, r, 12, 2).transpose(0, 2, 1, 3)
-    pulled = np.concatenate([pulled[..., 0], product[:, :, 13 + p :], pulled[..., 1]], axis=2)
+    reactions = ((met[:m, :, :12] * drawn[..., None]).reshape(m, -1) for drawn in (signs, bridge))
+    summed = (sums_by_interval(model, x, rows.own, ties).reshape(-1, r, 12) for x in reactions)
+    alone, together = (x.transpose(0, 2, 1) for x in summed)
+    pulled = np.concatenate([alone, product[:, :, 13 + p :], together], axis=2)
     # Chain blocks: an interval's rows pull at the knot before it and, where the record goes on, at the one after.
     last = min(ties.stop, len(normal.diagonal) - 1)
     inside, following = slice(0, last - ties.start), slice(ties.start + 1, last + 1)
