@@ -39,6 +39,8 @@ BIAS = {
     "gyroscope": (7.0283, -9.6219, -11.728),
 }
 MID_SCALE = 32768.0
+BLOCK = 65_536
+"""Samples of the motion evaluated at once: a record of an hour has thousands of doublets, of which each meets few."""
 
 
 @dataclass(frozen=True)
@@ -139,14 +141,23 @@ class Motion:
 
     def euler(self, t: Array) -> tuple[Array, Array]:
         """Bank, pitch, heading (n, 3) and their derivatives at times t (n,)."""
-        x = 2 * np.pi * (t[:, None] - self.starts) / self.lengths
+        if len(t) <= BLOCK:
+            return self._euler(t, np.ones(len(self.starts), dtype=bool))
+        parts = [t[at : at + BLOCK] for at in range(0, len(t), BLOCK)]
+        blocks = [self._euler(p, (self.starts < p.max()) & (self.starts + self.lengths > p.min())) for p in parts]
+        return np.concatenate([angle for angle, _ in blocks]), np.concatenate([dot for _, dot in blocks])
+
+    def _euler(self, t: Array, flown: Array) -> tuple[Array, Array]:
+        """The same, of those doublets that are `flown` meanwhile."""
+        starts, lengths, amplitudes = self.starts[flown], self.lengths[flown], self.amplitudes[flown]
+        x = 2 * np.pi * (t[:, None] - starts) / lengths
         inside = (x > 0) & (x < 2 * np.pi)
         x = np.where(inside, x, 0.0)
         peak = 1.299038105676658  # of sin x − ½ sin 2x, at 2π/3
         shape = (np.sin(x) - 0.5 * np.sin(2 * x)) / peak
-        slope = np.where(inside, (np.cos(x) - np.cos(2 * x)) / peak, 0.0) * 2 * np.pi / self.lengths
+        slope = np.where(inside, (np.cos(x) - np.cos(2 * x)) / peak, 0.0) * 2 * np.pi / lengths
         angle, angle_dot = self._sum(self.tremor, t, 0), self._sum(self.tremor, t, 1)
-        return shape @ self.amplitudes + angle, slope @ self.amplitudes + angle_dot
+        return shape @ amplitudes + angle, slope @ amplitudes + angle_dot
 
     @staticmethod
     def _sum(lines: tuple[Array, Array, Array], t: Array, derivative: int) -> Array:

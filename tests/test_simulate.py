@@ -94,6 +94,14 @@ def test_rates_are_the_derivative_of_the_attitude(bare: Recording) -> None:
     np.testing.assert_allclose(motion.rate_dot(t), wider, atol=2e-3)  # jerk jumps where a doublet begins
 
 
+def test_a_long_motion_is_the_same_by_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    motion, t = Motion(Experiment(duration_s=90.0, sets=6), np.random.default_rng(4)), np.linspace(0.0, 90.0, 4001)
+    whole = motion.euler(t)
+    monkeypatch.setattr("fieldcal.simulate.BLOCK", 500)
+    for part, own in zip(motion.euler(t), whole, strict=True):
+        np.testing.assert_allclose(part, own, rtol=0.0, atol=1e-14)
+
+
 def test_position_is_the_acceleration_integrated_twice() -> None:
     motion, h = Motion(Experiment(translation_rms_mps2=0.5), np.random.default_rng(2)), 1e-3
     t = np.arange(0.0, 20.0, 0.1)
