@@ -293,13 +293,15 @@ def axis_noise_share(fit: JointFit) -> Array:
 
 
 def misfit(fit: JointFit, name: str) -> float:
-    """Rms of a vector triad's residual (robust level) over the sensed length."""
+    """Rms of what a vector triad reads beside the field or gravity, over their length: its residual (robust level) and,
+    for the accelerometer, the translation, which stands in the model but says nothing of a scale."""
     row = 3 * fit.model.rows.index(name)
     scale = fit.state.values[name][:3]
-    level = np.sqrt(np.sum(fit.levels.variance[row : row + 3] * scale**2))
+    square = np.sum(fit.levels.variance[row : row + 3] * scale**2)
     readings = fit.model.readings
-    length = np.linalg.norm(readings.field_ned) if name == "magnetometer" else abs(readings.gravity_mps2)
-    return float(level / length)
+    if name == "accelerometer":
+        return float(np.sqrt(square + 3.0 * fit.levels.strength**2) / abs(readings.gravity_mps2))
+    return float(np.sqrt(square) / np.linalg.norm(readings.field_ned))
 
 
 def _measured(fit: JointFit, axes: Array) -> dict[str, Any]:
