@@ -23,7 +23,8 @@ from warehouse.publish import publish
 from warehouse.store import empty_frame, read_table
 
 KEY = ["imu_id", "sensor", "method", "parameter", "axis"]
-SIBLINGS = ("sensor", "method", "parameter", "axis", "unit")
+ALIKE = ("sensor", "method", "parameter", "unit")
+SIBLINGS = (*ALIKE, "axis")
 SIGNED = ("scale", "bias", "zero_bias")
 """Parameters whose sign follows the polarity of the axis: siblings may be mounted the other way round."""
 NO_BENDS: Bends = {}
@@ -166,8 +167,7 @@ def trends_of(
         temperature_min_degc=pl.col("temperature_degc").min(),
         temperature_max_degc=pl.col("temperature_degc").max(),
     )
-    siblings = rows.select(pl.struct("sensor", "method", "parameter", "unit").rank("dense")).to_series()
-    kept = replace(kept, kind=siblings.to_numpy())
+    kept = replace(kept, kind=_labels(rows, ALIKE))
     imu = rows["imu_id"].rle_id().to_numpy()
     trends = drift.judge(memory.of(kept, imu), kept.kind)
     curves = bent(flights, kept, rows, trends, bends)
@@ -184,10 +184,9 @@ def trends_of(
     # A flight set aside is not what the line is as of.
     last = numbered.filter(pl.Series(trends.kept)).group_by("row").agg(as_of=pl.col("started_at").last())
     rows = rows.join(last, on="row", how="left", maintain_order="left")
-    group = rows.select(pl.struct(*SIBLINGS).rank("dense")).to_series().to_numpy()
     stepped, drifting = drift.moving(trends)
     steady = (trends.n_sessions >= ENOUGH_SESSIONS) & ~stepped & ~drifting
-    return rows, *few_sessions.borrow(kept, trends, group, _sign(rows, trends), steady)
+    return rows, *few_sessions.borrow(kept, trends, _labels(rows, SIBLINGS), _sign(rows, trends), steady)
 
 
 def _with_curves(rows: pl.DataFrame, curves: Bent | None) -> pl.DataFrame:
@@ -217,13 +216,16 @@ def _siblings(rows: pl.DataFrame, trends: drift.Trends) -> tuple[np.ndarray, np.
         scatter = np.log(trends.session_sd + trends.flight_sd + trends.sd)
         scatter_sd = 1.0 / np.sqrt(2.0 * np.maximum(trends.n_sessions - 1, 1))
     value, sd = np.where(clock, scatter, value), np.where(clock, scatter_sd, sd)
-    group = rows.select(pl.struct(*SIBLINGS).rank("dense")).to_series().to_numpy().astype(np.int64)
+    group, kind = (_labels(rows, columns).astype(np.int64) for columns in (SIBLINGS, ALIKE))
     alone = (trends.n_sessions < ENOUGH_SESSIONS) | ~np.isfinite(value) | ~np.isfinite(sd)
-    kind = rows.select(pl.struct("sensor", "method", "parameter", "unit").rank("dense")).to_series().to_numpy()
-    kind = kind.astype(np.int64)
     for label in (group, kind):
         label[alone] = label.max() + 1 + np.arange(alone.sum())
     return group, kind, np.where(alone, 0.0, value), np.where(alone, 1.0, sd)
+
+
+def _labels(rows: pl.DataFrame, columns: tuple[str, ...]) -> np.ndarray:
+    """A number (g,) for each row, the same where `columns` are."""
+    return rows.select(pl.struct(*columns).rank("dense")).to_series().to_numpy()
 
 
 def _moments(day: np.ndarray) -> pl.Series:

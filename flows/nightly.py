@@ -8,11 +8,9 @@ result record of Prefect's chooses its own deserialiser). Where Prefect's server
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +32,7 @@ from flows.log_ledger import write_ledger
 from flows.outcome import Outcome, summary
 from flows.plan import Plan, make_plan
 from flows.pool import hand_over, pool_answers
-from flows.processes import process_answers, processes_begun
+from flows.processes import process_answers, processes_begun, spawned
 from flows.runners import Answers, Parallel, batches, dask_answers
 from flows.show import say
 from flows.source_ledger import know_sources
@@ -166,8 +164,8 @@ def prepared(
     source, settings, plan = _plan(root_of_logs, root, config, only)
     _planned[(root_of_logs, root, config, only)] = source, settings, plan
     n_batches = len(batches(_missing(plan), parallel.workers))
-    spawned = parallel.runner == "process" and not parallel.in_this_process(n_batches)
-    with processes_begun(parallel.workers) if spawned else nullcontext():
+    elsewhere = parallel.runner == "process" and not parallel.in_this_process(n_batches)
+    with processes_begun(parallel.workers) if elsewhere else nullcontext():
         yield
 
 
@@ -265,7 +263,7 @@ def _one_by_one(given: dict[str, Any]) -> dict[str, Any]:
     """The flights of a batch whose process died, each in a process of its own: only the guilty one is lost."""
     outcomes: list[dict[str, Any]] = []
     for job in given["jobs"]:
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+        with spawned(1) as alone:
             try:
                 answer = alone.submit(flights, given["root"], given["source"], [job], given["code"]).result()
             except BrokenProcessPool:

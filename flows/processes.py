@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
+from importlib import import_module
 from multiprocessing import get_context
 from typing import Any
 
@@ -22,7 +23,7 @@ _begun: list[ProcessPoolExecutor] = []
 @contextmanager
 def processes_begun(workers: int) -> Iterator[None]:
     """Within the block processes start and import what a batch needs; `process_answers` takes them."""
-    with _processes(workers) as pool:
+    with spawned(workers) as pool:
         for _ in range(workers):
             pool.submit(_import)
         _begun.append(pool)
@@ -35,7 +36,7 @@ def processes_begun(workers: int) -> Iterator[None]:
 def process_answers(workers: int, inputs: Sequence[dict[str, Any]]) -> Answers:
     """Run the batches; call it within the flow run that their tasks belong to."""
     context = _context()
-    with nullcontext(_begun.pop()) if _begun else _processes(workers) as pool:
+    with nullcontext(_begun.pop()) if _begun else spawned(workers) as pool:
         waiting: dict[Future[dict[str, Any]], dict[str, Any]] = {}
         waiting |= {pool.submit(_batch, context, given): given for given in inputs}
         while waiting:
@@ -45,7 +46,8 @@ def process_answers(workers: int, inputs: Sequence[dict[str, Any]]) -> Answers:
         pool.shutdown(wait=False)  # they tell Prefect the rest while the night publishes
 
 
-def _processes(workers: int) -> ProcessPoolExecutor:
+def spawned(workers: int) -> ProcessPoolExecutor:
+    """Processes that inherit nothing of this one."""
     return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
 
 
@@ -59,7 +61,7 @@ def _context() -> dict[str, Any]:
 
 
 def _import() -> None:
-    import flows.nightly  # noqa: F401
+    import_module("flows.nightly")
 
 
 def _batch(context: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
