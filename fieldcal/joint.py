@@ -251,8 +251,16 @@ def linearised(
     vps: VpsRecord | None,
 ) -> tuple[Normal, Joints, tuple[Array, Array]]:
     """Normal equations of everything but the prior, the joints in them, and every row's own reaction to the probe."""
-    normal, moved, reaction = _normal_equations(model, state, path, layout, p, weight, levels, probe)
-    joints = Joints(path.jump, moved, levels.walk, state.motion, levels.strength)
+    knots, rows = len(model.knots.index), 3 * len(model.rows)
+    normal = Normal.empty(knots, p, len(RIGHTS))
+    reaction = np.zeros((knots, len(SENSED), 2 * rows + 3)), np.zeros((p + 1, 2 * rows + 3))
+    moved = np.zeros((knots, 3, p))  # ∂(integrated attitude)/∂θ
+    whitening = _whitening(weight, levels)
+    chunk: Rows
+    for ties, chunk, ends in sensitivities(model, state, path, layout, p):
+        accumulate(normal, model, chunk, ties, whitening[chunk.own], probe, reaction)
+        moved[ties] = ends
+    joints = Joints(path.jump, moved[:-1], levels.walk, state.motion, levels.strength)
     add_joints(normal, model.knots, joints, probe)
     if vps is not None:
         vps.add(normal, model, state, path, layout)
@@ -262,29 +270,6 @@ def linearised(
 def _whitening(weight: Array, levels: Levels) -> Array:
     """Robust weights over what low-frequency noise the rows carry, (m, r), 1/x²."""
     return np.asarray(weight / (levels.variance * levels.colour))
-
-
-def _normal_equations(
-    model: Model,
-    state: State,
-    path: Trajectory,
-    layout: Mapping[str, slice],
-    p: int,
-    weight: Array,
-    levels: Levels,
-    probe: Probe,
-) -> tuple[Normal, Array, tuple[Array, Array]]:
-    """Those of the sensors; ∂(integrated attitude)/∂θ (K−1, 3, p); and every row's own reaction to the probe."""
-    knots, rows = len(model.knots.index), 3 * len(model.rows)
-    normal = Normal.empty(knots, p, len(RIGHTS))
-    reaction = np.zeros((knots, len(SENSED), 2 * rows + 3)), np.zeros((p + 1, 2 * rows + 3))
-    moved = np.zeros((knots, 3, p))
-    whitening = _whitening(weight, levels)
-    chunk: Rows
-    for ties, chunk, ends in sensitivities(model, state, path, layout, p):
-        accumulate(normal, model, chunk, ties, whitening[chunk.own], probe, reaction)
-        moved[ties] = ends
-    return normal, moved[:-1], reaction
 
 
 @dataclass(frozen=True)

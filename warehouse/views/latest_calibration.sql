@@ -1,8 +1,9 @@
 -- One row an IMU, sensor, parameter and axis: the value at 25 degC, its sd and its slope, where they come from (source)
 -- and why. source = 'drift': the unit's trend as of its last flight, which draws a noisy single flight towards the history
--- by its sd; with two to four sessions the siblings lend the scatter and the slope. source = 'flight': the latest value that was not refused, where there is no trend yet, or where it lies more
--- than 5 sd off the trend: what may be the first flight after a step is never averaged away. With a slope it is
--- brought to 25 degC, else taken as it is, whatever its temperature. sd goes with best_known_degc: var(T) = sd^2 +
+-- by its sd; with two to four sessions the siblings lend the scatter and the slope. source = 'flight': the latest value
+-- that was not refused, where there is no trend yet, or where it lies more than 5 sd off the trend: what may be the
+-- first flight after a step is never averaged away. With a slope it is brought to 25 degC, else taken as it is,
+-- whatever its temperature. sd goes with best_known_degc: var(T) = sd^2 +
 -- slope_per_degc_sd^2 ((T - best)^2 - (25 - best)^2). Of several methods in a flight the most exact counts.
 CREATE VIEW latest_calibration AS
 WITH latest AS (
