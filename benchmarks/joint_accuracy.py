@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -95,11 +95,9 @@ def _rows(results: dict[str, StageResult], method: str, name: str) -> pl.DataFra
 def _against_vps(recording: Recording, results: dict[str, StageResult], method: str) -> Iterator[tuple[str, float]]:
     sync = results["vps_sync"].tables.get("sync")
     if sync is not None and sync["status"][0] == "ok":
-        e = recording.experiment
-        middle = 0.5 * (recording.t[0] + recording.t[-1])
-        true = middle - ((middle - recording.delay_s) * (1 + 1e-6 * e.vps_skew_ppm) + e.vps_offset_s)
-        yield "lag", 1e3 * abs(float(sync["lag_mid_s"][0]) - float(true))
-        yield "skew error ppm", abs(float(sync["skew_ppm"][0]) - e.vps_skew_ppm)
+        middle = 0.5 * float(recording.t[0] + recording.t[-1])
+        yield "lag", 1e3 * abs(float(sync["lag_mid_s"][0]) - recording.lag_at(middle))
+        yield "skew error ppm", abs(float(sync["skew_ppm"][0]) - recording.experiment.vps_skew_ppm)
     fit = results["verify"].tables.get("fit")
     if fit is not None:
         own = "joint" if method == "joint" else "output_error"
@@ -180,11 +178,17 @@ def _start(
     return {name: value for name, value in own.items() if value is not None}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def flights_of(description: str | None, cases: Iterable[str]) -> argparse.ArgumentParser:
+    """Options of a study over simulated flights: how many, which seeds, which cases."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--flights", type=int, default=32)
     parser.add_argument("--first-seed", type=int, default=1000)
-    parser.add_argument("--case", action="append", choices=list(CASES))
+    parser.add_argument("--case", action="append", choices=list(cases))
+    return parser
+
+
+def main() -> None:
+    parser = flights_of(__doc__, CASES)
     parser.add_argument("--speed", action="store_true")
     given = parser.parse_args()
     if given.speed:

@@ -9,30 +9,23 @@ The lever arm is unknown to the estimate, translation is 0.3 m/s² rms.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 
 import numpy as np
 import polars as pl
-from joint_accuracy import MOVING
+from joint_accuracy import CASES as ALL
+from joint_accuracy import flights_of
 
 from fieldcal.pipeline import run_flight
-from fieldcal.simulate import Experiment, Recording, simulate
+from fieldcal.simulate import Recording, simulate
 from fieldcal.simulate_logs import settings, signals
 
-FAULTY = {"vps_dropout_share": 0.1, "vps_outlier_share": 0.01, "vps_skew_ppm": 200.0, "vps_misalignment_rad": 0.1}
 CASES = {
-    "no translation": Experiment(),
-    "translation": MOVING,
-    "translation; dropouts, outliers, 200 ppm, misaligned": replace(MOVING, **FAULTY),  # type: ignore[arg-type]
-    "the same, VPS at 100 Hz": replace(MOVING, **FAULTY, vps_rate_hz=100.0),  # type: ignore[arg-type]
+    "no translation": ALL["clean"],
+    "translation": ALL["translation"],
+    "translation; dropouts, outliers, 200 ppm, misaligned": ALL["vps"],
+    "the same, VPS at 100 Hz": replace(ALL["vps"], vps_rate_hz=100.0),
 }
-
-
-def true_lag_s(r: Recording, at_s: float) -> float:
-    """VPS clock + lag = IMU clock, at IMU time `at_s`, the sensor filter's delay included."""
-    e = r.experiment
-    return at_s - ((at_s - r.delay_s) * (1 + 1e-6 * e.vps_skew_ppm) + e.vps_offset_s)
 
 
 def errors(r: Recording) -> tuple[float, float, float, float] | None:
@@ -42,7 +35,7 @@ def errors(r: Recording) -> tuple[float, float, float, float] | None:
     if sync is None or sync["status"][0] != "ok":
         return None
     row = sync.row(0, named=True)
-    middle = row["lag_mid_s"] - true_lag_s(r, 0.5 * float(r.t[0] + r.t[-1]))
+    middle = row["lag_mid_s"] - r.lag_at(0.5 * float(r.t[0] + r.t[-1]))
     skew = row["skew_ppm"] - r.experiment.vps_skew_ppm
     return middle, skew, middle / row["lag_sd_s"], skew / row["skew_sd_ppm"]
 
@@ -54,11 +47,7 @@ def cell(x: np.ndarray) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--flights", type=int, default=32)
-    parser.add_argument("--first-seed", type=int, default=1000)
-    parser.add_argument("--case", action="append", choices=list(CASES))
-    given = parser.parse_args()
+    given = flights_of(__doc__, CASES).parse_args()
     print(f"{given.flights} flights, seeds from {given.first_seed}; median / 95th percentile / rms\n")
     print("| case | refused | lag at mid-flight, ms | skew, ppm | lag error ÷ sd, rms | skew error ÷ sd, rms |")
     print("|---|---|---|---|---|---|")

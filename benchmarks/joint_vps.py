@@ -9,11 +9,10 @@ against the truth delayed by the sensor filter; "NEES" is the mean of (error ÷ 
 
 from __future__ import annotations
 
-import argparse
 from collections import defaultdict
 
 import numpy as np
-from joint_accuracy import CASES, measure
+from joint_accuracy import CASES, flights_of, measure
 
 from fieldcal.simulate import SENSORS, simulate
 
@@ -29,11 +28,7 @@ SHOWN = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--flights", type=int, default=32)
-    parser.add_argument("--first-seed", type=int, default=1000)
-    parser.add_argument("--case", action="append", choices=list(CASES))
-    given = parser.parse_args()
+    given = flights_of(__doc__, CASES).parse_args()
     print(f"{given.flights} flights, seeds from {given.first_seed}; median / 95th percentile\n")
     print("| case | quantity | joint | joint with VPS |\n|---|---|---|---|")
     for case in given.case or list(CASES):

@@ -92,8 +92,8 @@ class Recording:
 
     Logged: `t` (n,) IMU stamps, s; `counts` sensor → (n, 3); `temperature` (n,) °C; `vps_t` (m,) s on the VPS clock;
     `vps_q` (m, 4) body to NED world; `vps_position` (m, 3) m.
-    Truth: `q` (n, 4) and `rate` (n, 3) at t as the sensors saw them, i.e. delayed by the sensor filter; `lag_s` (VPS
-    clock + lag = IMU clock at the first IMU sample) including that delay; `delay_s`; the two constant VPS rotations.
+    Truth: `q` (n, 4) and `rate` (n, 3) at t as the sensors saw them, i.e. `delay_s` late by the sensor filter; the two
+    constant VPS rotations.
     """
 
     experiment: Experiment
@@ -106,9 +106,18 @@ class Recording:
     q: Array
     rate: Array
     delay_s: float
-    lag_s: float
     vps_world_rotation: Array
     vps_body_rotation: Array
+
+    def lag_at(self, imu_time_s: float) -> float:
+        """VPS clock + lag = IMU clock, s, at an IMU time; the sensors' delay is in it."""
+        skew = 1e-6 * self.experiment.vps_skew_ppm
+        return float(imu_time_s - ((imu_time_s - self.delay_s) * (1 + skew) + self.experiment.vps_offset_s))
+
+    @property
+    def lag_s(self) -> float:
+        """Lag at the first IMU sample."""
+        return self.lag_at(self.t[0])
 
 
 class Motion:
@@ -225,8 +234,6 @@ def simulate(experiment: Experiment | None = None, **changes: object) -> Recordi
         from_rotation_vector(e.vps_misalignment_rad * _unit(streams["vps"])),
     )
     vps_t, vps_q, vps_position = _vps(e, motion, streams["vps"], world, body)
-    skew = 1e-6 * e.vps_skew_ppm
-    lag = t[0] - ((t[0] - delay_s) * (1 + skew) + e.vps_offset_s)
     return Recording(
         experiment=e,
         t=t,
@@ -238,7 +245,6 @@ def simulate(experiment: Experiment | None = None, **changes: object) -> Recordi
         q=motion.attitude(t - delay_s),
         rate=motion.rate(t - delay_s),
         delay_s=delay_s,
-        lag_s=float(lag),
         vps_world_rotation=world,
         vps_body_rotation=body,
     )
