@@ -30,6 +30,7 @@ class StageResult:
     measured: dict[str, Any] = field(default_factory=dict)
 
 
+ZERO_SLOPE = "zero_per_degc"
 FAULT_SCHEMA = {
     "sensor": pl.String,
     "axis": pl.String,
@@ -115,3 +116,33 @@ def triad_rows(
                 variance = covariance[i, i] if i == j else own_variance
                 add("scale", row + column, i, matrix[i, j], variance, scale_unit)
     return rows
+
+
+def zero_slope_rows(
+    sensor: str,
+    method: str,
+    slope: ArrayLike,
+    sd: ArrayLike,
+    *,
+    logged_unit: str,
+    temperature_degc: float | None,
+    reason_code: Sequence[str | None] = (None, None, None),
+) -> list[dict[str, Any]]:
+    """Rows zero_per_degc of one triad: slope (3,) of its zero on temperature and sd (3,), logged units per °C; an axis
+    with a reason code is refused."""
+    unit = f"({logged_unit})/degC" if "/" in logged_unit else f"{logged_unit}/degC"
+    return [
+        {
+            "sensor": sensor,
+            "method": method,
+            "parameter": ZERO_SLOPE,
+            "axis": axis,
+            "value": float(value),
+            "sd": float(own_sd),
+            "unit": unit,
+            "temperature_degc": temperature_degc,
+            "status": "refused" if code else "ok",
+            "reason_code": code,
+        }
+        for axis, value, own_sd, code in zip(AXES, np.asarray(slope), np.asarray(sd), reason_code, strict=True)
+    ]

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from fieldcal import smoothing
-from fieldcal.results import StageResult
+from fieldcal.results import StageResult, fatal_fault
 from fieldcal.rotation import Array
 from fieldcal.sensor import default_reference_reading
 
@@ -23,6 +23,12 @@ def mean_temperature(tables: Tables) -> float | None:
     """Mean logged temperature, °C, over the flight."""
     table = tables.get("temperature")
     return None if table is None or table.is_empty() else float(table["temperature_degc"].mean())  # type: ignore[arg-type]
+
+
+def is_sound(tables: Tables, sensor: str) -> bool:
+    """Whether neither the sanity check nor the motors' current found a fatal fault of a sensor."""
+    told = [tables[name] for name in ("faults", "motor_faults") if name in tables]
+    return all(fatal_fault(faults, (sensor,)) is None for faults in told)
 
 
 def in_used_segments(table: pl.DataFrame, segments: pl.DataFrame) -> np.ndarray:

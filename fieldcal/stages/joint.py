@@ -24,10 +24,10 @@ from fieldcal.frames import (
 from fieldcal.joint import JointFit, fit_joint
 from fieldcal.joint_covariance import advice
 from fieldcal.joint_record import TERMS, Readings
-from fieldcal.results import StageResult, fatal_fault, triad_rows
+from fieldcal.results import StageResult, fatal_fault, triad_rows, zero_slope_rows
 from fieldcal.rotation import Array, body_from_inertial, from_matrix, multiply
 from fieldcal.stages.attitude import logged_constants
-from fieldcal.stages.inputs import Settings, Tables, mean_temperature, reference_reading, refusal
+from fieldcal.stages.inputs import Settings, Tables, is_sound, mean_temperature, reference_reading, refusal
 from fieldcal.stages.joint_reference import Poses, poses_of, with_poses
 
 METHOD = "joint"
@@ -127,9 +127,8 @@ def readings_of(tables: Tables, s: Settings) -> Readings:
         nearest = np.where(at - t[after - 1] < t[after] - at, after - 1, after)
         own[nearest[np.abs(t[nearest] - at) < 2.0 * float(np.median(np.diff(t)))]] = True
         logged["magnetometer"] = np.where(own[:, None], logged["magnetometer"], np.nan)
-    told = [tables[name] for name in ("faults", "motor_faults") if name in tables]
-    sound = {name: all(fatal_fault(faults, (name,)) is None for faults in told) for name in SENSORS}
-    given = {n: x if sound[n] and np.isfinite(x).any() else None for n, x in logged.items() if n != "gyroscope"}
+    vectors = {name: x for name, x in logged.items() if name != "gyroscope"}
+    given = {name: x if is_sound(tables, name) and np.isfinite(x).any() else None for name, x in vectors.items()}
     return Readings(
         warmth=_warmth(tables, t),
         t=t,
@@ -227,22 +226,15 @@ def _slope_rows(fit: JointFit, tables: Tables, s: Settings, codes: list[str | No
     spread = fit.model.triads["gyroscope"].spread
     value = -fit.state.values["gyroscope_temperature"] * spread
     sd = np.sqrt(np.diagonal(fit.covariance)[fit.layout["gyroscope_temperature"]]) * spread
-    unit = s["units"]["gyroscope"]
-    return [
-        {
-            "sensor": "gyroscope",
-            "method": METHOD,
-            "parameter": "zero_per_degc",
-            "axis": axis,
-            "value": float(value[i]),
-            "sd": float(sd[i]),
-            "unit": f"({unit})/degC" if "/" in unit else f"{unit}/degC",
-            "temperature_degc": mean_temperature(tables),
-            "status": "refused" if codes[i] else "ok",
-            "reason_code": codes[i],
-        }
-        for i, axis in enumerate(AXES)
-    ]
+    return zero_slope_rows(
+        "gyroscope",
+        METHOD,
+        value,
+        sd,
+        logged_unit=s["units"]["gyroscope"],
+        temperature_degc=mean_temperature(tables),
+        reason_code=codes,
+    )
 
 
 def _judged(name: str, fit: JointFit, scale: Array, covariance: Array, s: Settings) -> list[str | None]:

@@ -10,7 +10,7 @@ import polars as pl
 from fieldcal import sensor, smoothing, sync
 from fieldcal.errors import UnusableFlight
 from fieldcal.frames import AXES, QUATERNION, columns_of, constants, matrix, seconds, triad
-from fieldcal.results import StageResult, fatal_fault
+from fieldcal.results import StageResult
 from fieldcal.rotation import (
     Array,
     body_from_inertial,
@@ -23,7 +23,7 @@ from fieldcal.rotation import (
     slerp,
 )
 from fieldcal.stages.attitude import logged_constants
-from fieldcal.stages.inputs import Settings, Tables
+from fieldcal.stages.inputs import Settings, Tables, is_sound
 from fieldcal.sync_field import refine_by_field
 
 NED_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # rotation of ENU components to NED
@@ -110,9 +110,8 @@ def _refined(
     fit: sync.SyncFit, tables: Tables, s: Settings, origin: int, t_vps: Array, q_vps: Array
 ) -> tuple[sync.SyncFit, dict[str, Any]]:
     """The clock by a sound magnetometer too, and what that found."""
-    told = [tables[name] for name in ("faults", "motor_faults") if name in tables]
     table = tables.get("magnetometer_log")
-    if table is None or table.is_empty() or any(fatal_fault(faults, ("magnetometer",)) for faults in told):
+    if table is None or table.is_empty() or not is_sound(tables, "magnetometer"):
         return fit, {"synchronised_by": "gyroscope"}
     logged = matrix(table, triad("magnetometer"))
     refined, own = refine_by_field(

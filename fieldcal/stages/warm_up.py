@@ -8,12 +8,12 @@ import numpy as np
 
 from fieldcal import warm_up
 from fieldcal.errors import UnusableFlight
-from fieldcal.frames import AXES, calibration_rows, constants, matrix, seconds, triad
-from fieldcal.results import StageResult, fatal_fault
+from fieldcal.frames import calibration_rows, constants, matrix, seconds, triad
+from fieldcal.results import ZERO_SLOPE, StageResult, zero_slope_rows
 from fieldcal.rotation import Array
-from fieldcal.stages.inputs import Settings, Tables
+from fieldcal.stages.inputs import Settings, Tables, is_sound
 
-METHOD, PARAMETER = "warm_up", "zero_per_degc"
+METHOD, PARAMETER = "warm_up", ZERO_SLOPE
 CURVE = "zero_over_temperature"
 """What stands in `measured`: the zero as a cubic of temperature, level left out, an axis a row."""
 
@@ -51,28 +51,20 @@ def find_warm_up(tables: Tables, s: Settings) -> StageResult:
 
 
 def _rows(sensor: str, found: warm_up.WarmUp, s: Settings) -> list[dict[str, Any]]:
-    unit = s["units"][sensor]
-    return [
-        {
-            "sensor": sensor,
-            "method": METHOD,
-            "parameter": PARAMETER,
-            "axis": axis,
-            "value": float(found.zero_per_degc[i]),
-            "sd": float(found.sd[i]),
-            "unit": f"({unit})/degC" if "/" in unit else f"{unit}/degC",
-            "temperature_degc": found.temperature_degc,
-            "status": "ok",
-            "reason_code": None,
-        }
-        for i, axis in enumerate(AXES)
-    ]
+    return zero_slope_rows(
+        sensor,
+        METHOD,
+        found.zero_per_degc,
+        found.sd,
+        logged_unit=s["units"][sensor],
+        temperature_degc=found.temperature_degc,
+    )
 
 
 def _resting(tables: Tables, s: Settings, t: Array, rate: Array, warm: Array) -> warm_up.WarmUp | None:
     """The accelerometer at rest; None without readings that can be trusted, constants, or such a rest."""
     known = constants(tables["accelerometer"], "accelerometer") if "accelerometer" in tables else None
-    if known is None or ("faults" in tables and fatal_fault(tables["faults"], ("accelerometer",)) is not None):
+    if known is None or not is_sound(tables, "accelerometer"):
         return None
     scale, bias = known
     logged = matrix(tables["imu"], triad("accelerometer"))
