@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
+from fieldcal.bias_walk import bias_walk
 from fieldcal.errors import EstimationError
 from fieldcal.joint_chain import (
     BRIDGE,
@@ -27,28 +27,26 @@ from fieldcal.joint_chain import (
     add_joints,
     joint_squares,
     solve_scaled,
+    whitened_motion,
 )
 from fieldcal.joint_covariance import covariance, inverse_information
 from fieldcal.joint_model import SENSED, Rows, Trajectory, accumulate, layout_of, residuals, sensitivities, trajectory
+from fieldcal.joint_noise import (
+    Levels,
+    first_levels,
+    gyro_walk,
+    passing_fields,
+    renewed_levels,
+    robust_weight,
+    unsettled_by,
+)
 from fieldcal.joint_record import CROSS, TRIADS, Model, State, off_diagonal
 from fieldcal.joint_scores import integrated_translation, logged_units, within_intervals
 from fieldcal.joint_vps import VpsRecord
-from fieldcal.rotation import Array
-from fieldcal.statistics import robust_sigma, white_noise_sigma
+from fieldcal.rotation import Array, body_from_inertial
 
-# Residual length, sd of a three-axis reading, beyond which a reading loses influence: χ²₃ passes it once in a thousand.
-CLIP = 4.0
-# The translation at the start, and the gyroscope's walk there over what its sample-to-sample noise makes: loose, since
-# the start is wrong by more than noise.
-ACCELERATION_START_MPS2, WALK_START = 0.2, 10.0
 LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
-# At most this multiple of it (a band limit hides a factor of about 4): a field that varies from place to place would
-# otherwise be taken for a gyroscope that walks.
-MOST_WALK = 10.0
-STIFFENING = 4.0
-LEAST_ACCELERATION_MPS2, LEAST_WALK, LEAST_VARIANCE = 2e-3, 1e-9, 1e-8
-# Bounds of a step of a variance: the translation may vanish, the walk is what ties the attitudes.
-LEAST_RATIO, MOST_RATIO = np.array([0.25, 0.01]), np.array([4.0, 10.0])
+BURST_ROUNDS = 3  # how often the fit looks for passing fields in what it left of the magnetometer
 MAX_ITERATIONS = 50
 # Settled: every step below this part of what one could claim as standard deviation, every noise level below it too.
 SETTLED = 0.1
@@ -61,23 +59,12 @@ VAGUE = 1.0  # rad of dip, m of lever arm
 
 
 @dataclass(frozen=True)
-class Levels:
-    """Noise: `variance` (r,) of each sensor row a sample, units of x; `colour` (r,) its density at low frequency over
-    that of white noise of the same variance; `walk` of the attitude by gyroscope noise, rad²/s; `strength` of the
-    translation, m/s² an axis."""
-
-    variance: Array
-    colour: Array
-    walk: float
-    strength: float
-
-
-@dataclass(frozen=True)
 class JointFit:
     """The solution in centred coordinates; θ is ordered by `layout`.
 
     `covariance` (p, p) of θ, coloured-residual form; `information` (p, p) with the knots eliminated; `weight` (m, r)
-    robust weights; `lever_arm_test` the Wald statistic (χ²₃) of a free lever arm, None where it was not tried."""
+    robust weights; `bias_walk` of the gyroscope's bias, rad/s/√s, whose spread over the record is in its covariance;
+    `lever_arm_test` the Wald statistic (χ²₃) of a free lever arm, None where it was not tried."""
 
     model: Model
     state: State
@@ -88,6 +75,7 @@ class JointFit:
     covariance: Array
     information: Array
     iterations: int
+    bias_walk: float = 0.0
     lever_arm_test: float | None = None
     vps: VpsRecord | None = None
 
@@ -158,6 +146,12 @@ def fit_joint(
     """
     free = try_lever_arm and "accelerometer" in model.rows
     fit, response = _iterate(model, start, levels, dip=free_dip, lever_arm=free, vps=vps)
+    for _ in range(BURST_ROUNDS):
+        passing = passing_fields(fit.model, fit.weight)
+        if not passing.any():
+            break
+        model = fit.model.without("magnetometer", passing)
+        fit, response = _iterate(model, fit.state, fit.levels, dip=free_dip, lever_arm=free, vps=vps)
     if not free:
         return _enlarged(fit, response)
     test = _lever_arm_test(fit)
@@ -169,7 +163,7 @@ def fit_joint(
         none = fit.covariance[:, own] @ np.linalg.solve(fit.covariance[own, own], fit.state.values["lever_arm"])
         without = fit.state.moved(response @ none, -none, fit.layout)
         without = replace(without, values={**without.values, "lever_arm": np.zeros(3)})
-        fit = _enlarged(*_iterate(model, without, fit.levels, dip=free_dip, lever_arm=False, vps=vps))
+        fit = _enlarged(*_iterate(fit.model, without, fit.levels, dip=free_dip, lever_arm=False, vps=vps))
     return replace(fit, lever_arm_test=test)
 
 
@@ -185,7 +179,20 @@ def _enlarged(fit: JointFit, response: Array) -> JointFit:
     poses = None if fit.vps is None else fit.vps.whitened(fit.model, fit.state, fit.path, fit.layout, response)
     knots = fit.model.knots
     jumps = fit.path.jump, np.sqrt(knots.joined / (fit.levels.walk * knots.interval_s))
-    return replace(fit, covariance=covariance(fit.model, chunks, response, fit.information, whitening, jumps, poses))
+    strength = fit.levels.strength
+    process = whitened_motion(knots, strength, response[:, 3:]), whitened_motion(knots, strength, fit.state.motion)
+    own = covariance(fit.model, chunks, response, fit.information, whitening, jumps, process, poses)
+    # The bias is the record's mean; its own walk takes it away from that to either end.
+    walk = bias_walk(_jump_rates(fit), knots.interval_s, knots.joined)
+    bias = np.arange(3, 6) + fit.layout["gyroscope"].start
+    own[bias, bias] += walk**2 * (fit.model.readings.t[-1] - fit.model.readings.t[0]) / 3.0
+    return replace(fit, covariance=own, bias_walk=walk)
+
+
+def _jump_rates(fit: JointFit) -> Array:
+    """Rate (K−1, 3), rad/s, sensor axes, that the attitude has beyond the gyroscope's over each interval."""
+    jump = np.einsum("kij,kj->ki", body_from_inertial(fit.state.q[:-1]), fit.path.jump)
+    return jump / fit.model.knots.interval_s[:, None]
 
 
 def _iterate(
@@ -198,7 +205,7 @@ def _iterate(
     probe = Probe.draw(knots, model.readings.t, model.at, 3 * len(model.rows))
     path = trajectory(model, state)
     residual = residuals(model, state, path)
-    levels = levels or _first_levels(model, state, path, residual)
+    levels = levels or first_levels(model, state, path, residual)
     for iteration in range(1, MAX_ITERATIONS + 1):
         weight = robust_weight(model, residual, levels)
         normal, joints, reaction = linearised(model, state, path, layout, p, weight, levels, probe, vps)
@@ -224,8 +231,8 @@ def _iterate(
         absorbed = np.einsum("kcr,kc->r", own_knots, response[:, SENSED, SENSORS]) + own_theta.T @ theta[:, SENSORS]
         joints = replace(joints, jump=path.jump, motion=state.motion)
         squares = joint_squares(knots, joints, response, theta, probe)
-        renewed = _levels(model, residual, levels, absorbed, squares, MOST_WALK * gyro_walk(model, state))
-        unsettled, levels = _unsettled(levels, renewed, squares), renewed
+        renewed = renewed_levels(model, residual, levels, absorbed, squares, gyro_walk(model, state))
+        unsettled, levels = unsettled_by(levels, renewed, squares), renewed
         claimed = 1.0 / np.sqrt(np.diagonal(information))
         settled = max(unsettled, float(np.max(np.abs(change) / claimed))) < SETTLED
         if settled or float(np.max(np.abs(change))) < ROUNDING:
@@ -304,81 +311,3 @@ def _least_part(state: State, step: Array, theta: Array, layout: Mapping[str, sl
             scale = np.abs(state.values[name][:3])
             longest.append(float(np.max(np.abs(theta[own][:3]) / scale)) / LARGEST_RELATIVE)
     return 1.0 / max(1.0, *longest)
-
-
-def _first_levels(model: Model, state: State, path: Trajectory, residual: Array) -> Levels:
-    known = np.repeat(np.column_stack([model.triads[name].known for name in model.rows]), 3, axis=1)
-    sigma = np.array([robust_sigma(r[k]) for r, k in zip(residual.T, known.T, strict=True)])
-    variance = np.maximum(sigma**2, LEAST_VARIANCE)
-    jumped = np.sum(path.jump**2) / (3.0 * np.sum(model.knots.interval_s * model.knots.joined))
-    walk = max(WALK_START * gyro_walk(model, state), float(jumped), LEAST_WALK)
-    strength = ACCELERATION_START_MPS2
-    if "accelerometer" in model.rows:
-        row = 3 * model.rows.index("accelerometer")
-        strength = max(strength, float(np.max(sigma[row : row + 3] * np.abs(state.values["accelerometer"][:3]))))
-    return Levels(variance, np.ones(len(variance)), walk, strength)
-
-
-def gyro_walk(model: Model, state: State) -> float:
-    """Walk of the integrated attitude, rad²/s, that the gyroscope's sample-to-sample noise makes."""
-    noise = np.max(white_noise_sigma(model.triads["gyroscope"].x) * np.abs(state.values["gyroscope"][:3]))
-    return float(noise**2 * np.median(np.diff(model.readings.t)))
-
-
-def _levels(model: Model, residual: Array, levels: Levels, absorbed: Array, squares: Array, most_walk: float) -> Levels:
-    """Variance components: squares over what the unknowns leave of their number."""
-    weight = robust_weight(model, residual, levels)
-    count = weight.sum(axis=0)
-    left = np.maximum(count - levels.colour * absorbed, 0.05 * count)
-    variance = np.maximum(np.sum(weight * residual**2, axis=0) / left, LEAST_VARIANCE)
-    # Upwards the fixed point; downwards halfway to Newton's method, whose steps follow a variance to nothing.
-    square, free, information = np.maximum(squares.T, 1e-9)
-    number = np.where(square < free, np.sqrt(free * np.minimum(information, free)), free)
-    ratio = np.clip(1.0 + (square - free) / number, LEAST_RATIO, MOST_RATIO)
-    walk, strength = levels.walk * ratio[0], levels.strength * np.sqrt(ratio[1])
-    return Levels(
-        variance,
-        _colour(model, residual, weight),
-        # A start that jumps is loose at first and stiffens by steps: the linear equations hold for small turns only.
-        float(np.clip(walk, LEAST_WALK, max(most_walk, levels.walk / STIFFENING, LEAST_WALK))),
-        max(float(strength), LEAST_ACCELERATION_MPS2),
-    )
-
-
-def _unsettled(before: Levels, after: Levels, squares: Array) -> float:
-    """Largest relative change of a noise variance; of walk and translation in standard deviations where one could claim
-    less than their own size."""
-    old, new = (np.r_[v.variance, v.walk, v.strength**2] for v in (before, after))
-    change = np.abs(new / old - 1.0)
-    change[-2:] *= np.minimum(1.0, np.sqrt(0.5 * squares[:, 2]))
-    return float(np.max(change))
-
-
-def robust_weight(model: Model, residual: Array, levels: Levels) -> Array:
-    """Redescending weights (m, r): 1 up to CLIP standard deviations of the reading, (CLIP/d)⁴ beyond, 0 for none.
-
-    With the square alone a wrong reading adds CLIP² to its variance, however far off, and six in a hundred of them
-    inflate that until none is an outlier. A magnetometer's d is of the reading alone or of the mean over an interval,
-    which shows the edges of a burst; what an accelerometer has in common over one is translation."""
-    out = np.empty_like(residual)
-    together = max(1, len(residual) // len(model.knots.index))
-    for i, name in enumerate(model.rows):
-        row = slice(3 * i, 3 * i + 3)
-        square = np.sum(residual[:, row] ** 2 / levels.variance[row], axis=1)
-        if name == "magnetometer":
-            mean = uniform_filter1d(residual[:, row], together, axis=0)
-            square = np.maximum(square, np.sum(mean**2 * together / (levels.variance * levels.colour)[row], axis=1))
-        weight = np.minimum(1.0, CLIP**2 / np.maximum(square, 1e-12)) ** 2 * model.triads[name].known
-        out[:, row] = weight[:, None]
-    return out
-
-
-def _colour(model: Model, residual: Array, weight: Array) -> Array:
-    """Density at low frequency over the white one, (r,): from the autocorrelation within half an interval."""
-    lags = int(np.clip(len(residual) / len(model.knots.index) / 2, 1, 8))
-    x = residual * np.sqrt(weight)
-    zero = np.maximum(np.sum(x * x, axis=0), 1e-300)
-    colour = np.ones(x.shape[1])
-    for lag in range(1, lags + 1):
-        colour += 2.0 * (1.0 - lag / (lags + 1)) * np.sum(x[lag:] * x[:-lag], axis=0) / zero
-    return np.clip(np.repeat(colour.reshape(-1, 3).mean(axis=1), 3), 1.0, 10.0)

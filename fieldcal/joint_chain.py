@@ -223,10 +223,18 @@ def _add_motion(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> N
 
 def whitened_joints(knots: Knots, joints: Joints) -> Array:
     """Each interval's attitude jump and the translation's process noise in it, over their sd, (K−1, 3 + 9)."""
-    ahead, behind, _ = _process(knots, joints.strength)
-    y = joints.motion.reshape(-1, ORDER, 3)
     jump = joints.jump * np.sqrt(knots.joined / (joints.walk * knots.interval_s))[:, None]
-    return np.hstack([jump, (ahead @ y[1:] - behind @ y[:-1]).reshape(len(jump), -1)])
+    return np.hstack([jump, whitened_motion(knots, joints.strength, joints.motion)[1:]])
+
+
+def whitened_motion(knots: Knots, strength: float, motion: Array) -> Array:
+    """The translation's process noise into each knot, or its state at a segment's first, over its sd, (K, 9) or
+    (K, 9, p) as `motion` is: linear in it."""
+    ahead, behind, first = _process(knots, strength)
+    y = motion.reshape(len(motion), ORDER, -1)
+    out = first @ y
+    out[1:] += ahead @ y[1:] - behind @ y[:-1]
+    return out.reshape(motion.shape)
 
 
 def joint_squares(knots: Knots, joints: Joints, state: Array, theta: Array, probe: Probe) -> Array:

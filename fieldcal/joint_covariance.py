@@ -11,6 +11,9 @@ from fieldcal.joint_record import Model, State
 from fieldcal.rotation import Array
 from fieldcal.statistics import coloured_information
 
+# Blocks whose pulls on θ are taken for independent: longer than translation or a passing field remembers.
+BLOCK_S, FEWEST_BLOCKS = 2.0, 6
+
 
 def covariance(
     model: Model,
@@ -19,13 +22,17 @@ def covariance(
     information: Array,
     whitening: Array,
     jumps: tuple[Array, Array],
+    process: tuple[Array, Array],
     others: tuple[Array, Array] | None = None,
 ) -> Array:
-    """Covariance (p, p) of θ: the inverse information, enlarged where the sensors' residuals are coloured.
+    """Covariance (p, p) of θ: the inverse information, enlarged where the residuals say that it is too small.
 
     Noise correlated within an interval is in the whitening already. What is correlated over longer times (a field that
     varies from place to place, a temperature) is judged from means by interval: M = ΣΣ S̄ᵀ𝓡S̄ instead of ΣS̄ᵀS̄ for each
-    sensor row, S̄ the sensitivity with the knots eliminated. No standard deviation is ever made smaller by it.
+    sensor row, S̄ the sensitivity with the knots eliminated. And what is not the noise that the model thinks (strong for
+    some seconds and weak for others, a translation that swings at one frequency) from the scores S̄ᵀr of blocks of
+    BLOCK_S, all residuals together: M = Σ(S̄ᵀr)(S̄ᵀr)ᵀ (cluster-robust; Liang and Zeger 1986). No standard deviation is
+    ever made smaller by either.
 
     Parameters
     ----------
@@ -39,14 +46,18 @@ def covariance(
         Weights over low-frequency variance.
     jumps : (K−1, 3), (K−1,) arrays
         Of the attitude at the joints and 1/their sd: coloured where the gyroscope's bias drifts.
+    process : (K, c, p), (K, c) arrays
+        Whitened sensitivities, knots eliminated, and residuals of the translation's process. They are not judged for
+        colour: what is left of them after the fit has it by the fit alone.
     others : (K, c, p), (K, c) arrays, optional
-        Whitened sensitivities, knots eliminated, and residuals of what else was measured at the knots.
+        The same of what else was measured at the knots.
     """
     inverse = inverse_information(information)
     k, r, p = len(response), whitening.shape[1], len(information)
     sensitivity, residual, count = np.zeros((k, r + 3, p)), np.zeros((k, r + 3)), np.zeros((k, r + 3))
     residual[:-1, r:], count[:-1, r:] = jumps[0] * jumps[1][:, None], 1.0
     sensitivity[:-1, r:] = np.diff(response[:, :3], axis=0)
+    score = np.zeros((k, p))
     for ties, rows, ends in chunks:
         at = model.at[rows.own]
         knot, share = model.knots.of_sample[at], model.knots.share[at, None, None]
@@ -56,9 +67,13 @@ def covariance(
         own = (rows.by_parameter - rows.by_knot @ between) * root[..., None]
         sensitivity[ties, :r] = sums_by_interval(model, own.reshape(len(at), -1), rows.own, ties).reshape(-1, r, p)
         sensitivity[ties, r:] += ends
-        residual[ties, :r] = sums_by_interval(model, rows.residual * root, rows.own, ties)
+        left = rows.residual * root
+        residual[ties, :r] = sums_by_interval(model, left, rows.own, ties)
+        score[ties] += sums_by_interval(model, np.einsum("mrp,mr->mp", own, left), rows.own, ties)
         count[ties, :r] = sums_by_interval(model, (root > 0).astype(float), rows.own, ties)
     sensitivity[:-1, r:] *= jumps[1][:, None, None]
+    for seen, left in ((sensitivity[:, r:], residual[:, r:]), process, *([] if others is None else [others])):
+        score += np.einsum("kcp,kc->kp", seen, left)
     scale = 1.0 / np.sqrt(np.maximum(count, 1.0))
     sensitivity, residual = sensitivity * scale[..., None], residual * scale
     excess = np.zeros((p, p))
@@ -71,10 +86,22 @@ def covariance(
         seen, left = others
         variance = float(np.mean(left[left != 0.0] ** 2)) if left.any() else 1.0
         excess += coloured_information(seen, left) / variance - np.einsum("kcp,kcq->pq", seen, seen)
-    coloured = np.diagonal(inverse @ excess @ inverse)
     plain = np.diagonal(inverse)
-    enlarged = np.sqrt(np.maximum(1.0, 1.0 + coloured / plain))
+    coloured = plain + np.diagonal(inverse @ excess @ inverse)
+    by_blocks = _variance_by_blocks(score @ inverse, model.readings.t[model.knots.index])
+    enlarged = np.sqrt(np.maximum(1.0, np.maximum(coloured, by_blocks) / plain))
     return np.asarray(inverse * np.outer(enlarged, enlarged))
+
+
+def _variance_by_blocks(step: Array, t: Array) -> Array:
+    """Variance (p,) of Σ step (K, p) at times t (K,) from its sums over blocks; 0 where there are too few."""
+    block = np.unique(np.floor((t - t[0]) / BLOCK_S), return_inverse=True)[1]
+    blocks = int(block[-1]) + 1
+    if blocks < FEWEST_BLOCKS:
+        return np.zeros(step.shape[1])
+    total = np.zeros((blocks, step.shape[1]))
+    np.add.at(total, block, step)
+    return np.asarray(blocks * np.var(total, axis=0, ddof=1))
 
 
 def inverse_information(information: Array) -> Array:

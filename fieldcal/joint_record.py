@@ -162,6 +162,12 @@ class Model:
         triads = {name: replace(x, x=x.x[own[name]], known=x.known[own[name]]) for name, x in self.triads.items()}
         return Model(self.readings.part(slice(a, b)), triads, knots, self.rows, self.at[rows] - a)
 
+    def without(self, name: str, rows: np.ndarray) -> Model:
+        """Rows (m,) of a vector triad taken for no readings."""
+        triad = self.triads[name]
+        left = replace(triad, known=triad.known & ~rows, x=np.where(rows[:, None], 0.0, triad.x))
+        return replace(self, triads={**self.triads, name: left})
+
     def field(self, dip: float) -> tuple[Array, Array]:
         """Local field (3,), NED, at a dip angle, rad, and its derivative."""
         north, east, _ = self.readings.field_ned

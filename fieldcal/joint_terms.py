@@ -15,9 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fieldcal.errors import EstimationError
-from fieldcal.joint import JointFit, Levels, fit_joint, linearised, robust_weight
+from fieldcal.joint import JointFit, fit_joint, linearised
 from fieldcal.joint_chain import GRADIENT, Probe, place_knots, whitened_joints
 from fieldcal.joint_model import layout_of, residuals, trajectory
+from fieldcal.joint_noise import Levels, robust_weight
 from fieldcal.joint_record import TERMS, Model, State
 from fieldcal.joint_vps import PARAMETERS, VpsRecord
 from fieldcal.rotation import Array

@@ -296,6 +296,15 @@ def misfit(fit: JointFit, name: str) -> float:
     return float(np.sqrt(square) / np.linalg.norm(readings.field_ned))
 
 
+def passing_field_share(fit: JointFit) -> float:
+    """Share of the magnetometer's readings left out as those of a passing field; 0 without one."""
+    logged = fit.model.readings.magnetometer
+    if logged is None or "magnetometer" not in fit.model.rows:
+        return 0.0
+    given = np.isfinite(logged[fit.model.at]).all(axis=1)
+    return float(1.0 - fit.model.triads["magnetometer"].known.sum() / given.sum())
+
+
 def _measured(fit: JointFit, axes: Array) -> dict[str, Any]:
     relative = {}
     for name in SENSORS:
@@ -309,8 +318,10 @@ def _measured(fit: JointFit, axes: Array) -> dict[str, Any]:
         "mean_robust_weight": {
             name: float(fit.weight[fit.model.triads[name].known, 3 * i].mean()) for i, name in enumerate(fit.model.rows)
         },
+        "passing_field_share": passing_field_share(fit),
         "misfit": {name: misfit(fit, name) for name in fit.model.rows},
         "gyro_walk_deg_per_sqrt_s": float(np.degrees(np.sqrt(fit.levels.walk))),
+        "gyro_bias_walk_radps_per_sqrt_s": fit.bias_walk,
         "gyro_noise_share": gyro_noise_share(fit),
         "axis_noise_share": [float(v) for v in axis_noise_share(fit)],
         "translation_rms_mps2": float(np.sqrt(3.0) * fit.levels.strength),
