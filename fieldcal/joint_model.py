@@ -304,10 +304,10 @@ def _padded(model: Model, own: slice, ties: slice) -> np.ndarray:
 def sums_by_interval(model: Model, x: Array, own: slice, ties: slice) -> Array:
     """Sums of the rows x (m, c) of a chunk over each of its intervals, (knots, c)."""
     starts = np.searchsorted(model.at[own], model.knots.index[ties])
-    empty = np.diff(np.r_[starts, len(x)]) == 0
-    sums = np.add.reduceat(x, np.minimum(starts, len(x) - 1), axis=0)
-    sums[empty] = 0.0
-    return np.asarray(sums)
+    some = np.diff(np.r_[starts, len(x)]) > 0
+    sums = np.zeros((len(starts), x.shape[1]))
+    sums[some] = np.add.reduceat(x, starts[some], axis=0)
+    return sums
 
 
 def layout_of(

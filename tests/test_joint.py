@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from fieldcal import joint_start
+from fieldcal import joint_model, joint_start
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.joint import JointFit, fit_joint
 from fieldcal.joint_record import TRIADS, Readings
@@ -100,6 +100,17 @@ def test_noise_free_truth_is_recovered() -> None:
         assert np.abs(relative_errors(r, fit, name)).max() < DISCRETISATION, name
     assert np.degrees(rms(angle_between(fit.path.q, r.q))) < 0.01
     assert not fit.state.values["lever_arm"].any()
+
+
+def test_every_row_counts_in_one_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(joint_model, "CHUNK_ROWS", 500)
+    given = readings(simulate(duration_s=20.0, sets=1, seed=1))
+    model, _ = joint_start.prepare(given, own_start(given, Experiment()))
+    sums = np.zeros((len(model.knots.index), 1))
+    for rows, ties in joint_model.chunks(model):
+        sums[ties] = joint_model.sums_by_interval(model, np.ones((rows.stop - rows.start, 1)), rows, ties)
+    knot = np.searchsorted(model.knots.index, model.at, side="right") - 1
+    assert np.array_equal(sums[:, 0], np.bincount(knot, minlength=len(sums)))
 
 
 @pytest.fixture(scope="module")
