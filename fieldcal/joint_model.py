@@ -84,7 +84,7 @@ def lever_arm_geometry(model: Model, state: State, own: slice) -> Array:
     scaled = state.values["gyroscope"]
     gyro = model.triads["gyroscope"]
     scale = scaled[:3] / gyro.spread
-    low_passed, change = model.readings.turning[:, model.at[own]]
+    low_passed, change = np.take(model.readings.turning, model.at[own], axis=1)
     rate = scale * (low_passed - gyro.centre) + scaled[3:]
     geometry = skew(scale * change) + rate[:, :, None] * rate[:, None, :]
     geometry[:, range(3), range(3)] -= np.sum(rate**2, axis=1)[:, None]
@@ -248,31 +248,31 @@ def accumulate(
     p, (m, r) = len(normal.parameters), weight.shape
     root = np.sqrt(weight)
     share = model.knots.share[model.at[rows.own], None, None]
-    met = np.empty((m + 1, r, 12 + p + 4))
+    met = np.empty((m + 1, r, 12 + p + 4 + 2))
     met[m] = 0.0  # one row of nothing, to fill shorter intervals with
-    before, after, given = met[:m, :, :6], met[:m, :, 6:12], met[:m, :, 12:]
+    before, after, given, drawn = np.split(met[:m], [6, 12, 16 + p], axis=2)
     np.multiply(rows.by_knot, root[..., None], out=before)
     np.multiply(before, share, out=after)
-    np.subtract(before, after, out=before)
+    before -= after
     np.multiply(rows.by_parameter, root[..., None], out=given[..., :p])
     np.multiply(rows.residual, root, out=given[..., p])
     np.multiply(rows.by_rotation * root[..., None], probe.bridge[rows.own, None], out=given[..., p + 1 :])
-    by_interval = np.take(met, _padded(model, rows.own, ties), axis=0).reshape(ties.stop - ties.start, -1, 16 + p)
-    product = by_interval[..., :12].transpose(0, 2, 1) @ by_interval  # (knots, 12, 16 + p)
-    flat = given.reshape(-1, p + 4)
+    np.multiply(probe.sensors[rows.own], root > 0, out=drawn[..., 0])
+    np.sum(given[..., p + 1 :], axis=2, out=drawn[..., 1])
+    by_interval = np.take(met, _padded(model, rows.own, ties), axis=0)  # (knots, most rows, r, 18 + p)
+    by_row = by_interval.transpose(0, 2, 3, 1)
+    alone, together = (by_row[:, :, :12] @ by_row[:, :, 16 + p :].transpose(0, 1, 3, 2)).transpose(3, 0, 2, 1)
+    by_interval = by_interval.reshape(ties.stop - ties.start, -1, 18 + p)
+    product = by_interval[..., :12].transpose(0, 2, 1) @ by_interval[..., : 16 + p]  # (knots, 12, 16 + p)
+    flat = met[:m].reshape(m * r, -1)[:, 12 : 16 + p]
     total = flat.T @ flat
-    bridge = given[..., p + 1 :].sum(axis=2)
-    signs = probe.sensors[rows.own] * (root > 0)
+    own = (given[..., :p].transpose(1, 2, 0) @ drawn[..., :1].transpose(1, 0, 2))[..., 0].T
     normal.parameters += total[:p, :p]
     normal.parameters_right[:, GRADIENT] += total[:p, p]
-    own = (flat[:, :p].reshape(m, r, p) * signs[..., None]).sum(axis=0).T
     normal.parameters_right[:, SENSORS] += own.sum(axis=1)
     normal.parameters_right[:, BRIDGE] += total[:p, p + 1 :].sum(axis=1)
     groups[1][:p, :r] += own
-    groups[1][p, r:] += np.r_[total[p + 1 :, p + 1 :].sum(axis=1), np.sum(bridge**2, axis=0)]
-    reactions = ((met[:m, :, :12] * drawn[..., None]).reshape(m, -1) for drawn in (signs, bridge))
-    summed = (sums_by_interval(model, x, rows.own, ties).reshape(-1, r, 12) for x in reactions)
-    alone, together = (x.transpose(0, 2, 1) for x in summed)
+    groups[1][p, r:] += np.r_[total[p + 1 :, p + 1 :].sum(axis=1), np.sum(drawn[..., 1] ** 2, axis=0)]
     pulled = np.concatenate([alone, product[:, :, 13 + p :], together], axis=2)
     # Chain blocks: an interval's rows pull at the knot before it and, where the record goes on, at the one after.
     last = min(ties.stop, len(normal.diagonal) - 1)
