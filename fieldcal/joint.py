@@ -63,8 +63,9 @@ class JointFit:
     """The solution in centred coordinates; θ is ordered by `layout`.
 
     `covariance` (p, p) of θ, coloured-residual form; `information` (p, p) with the knots eliminated; `weight` (m, r)
-    robust weights; `bias_walk` of the gyroscope's bias, rad/s/√s, whose spread over the record is in its covariance;
-    `lever_arm_test` the Wald statistic (χ²₃) of a free lever arm, None where it was not tried."""
+    robust weights; `iterations` of all rounds; `bias_walk` of the gyroscope's bias, rad/s/√s, whose spread over the
+    record is in its covariance; `lever_arm_test` the Wald statistic (χ²₃) of a free lever arm, None where it was not
+    tried."""
 
     model: Model
     state: State
@@ -145,13 +146,13 @@ def fit_joint(
     with the vehicle other than hard iron.
     """
     free = try_lever_arm and "accelerometer" in model.rows
-    fit, response = _iterate(model, start, levels, dip=free_dip, lever_arm=free, vps=vps)
+    fit, response = _iterate(model, start, levels, 0, dip=free_dip, lever_arm=free, vps=vps)
     for _ in range(BURST_ROUNDS):
         passing = passing_fields(fit.model, fit.weight)
         if not passing.any():
             break
         model = fit.model.without("magnetometer", passing)
-        fit, response = _iterate(model, fit.state, fit.levels, dip=free_dip, lever_arm=free, vps=vps)
+        fit, response = _iterate(model, fit.state, fit.levels, fit.iterations, dip=free_dip, lever_arm=free, vps=vps)
     if not free:
         return _enlarged(fit, response)
     test = _lever_arm_test(fit)
@@ -163,7 +164,10 @@ def fit_joint(
         none = fit.covariance[:, own] @ np.linalg.solve(fit.covariance[own, own], fit.state.values["lever_arm"])
         without = fit.state.moved(response @ none, -none, fit.layout)
         without = replace(without, values={**without.values, "lever_arm": np.zeros(3)})
-        fit = _enlarged(*_iterate(fit.model, without, fit.levels, dip=free_dip, lever_arm=False, vps=vps))
+        fit, response = _iterate(
+            fit.model, without, fit.levels, fit.iterations, dip=free_dip, lever_arm=False, vps=vps
+        )
+        fit = _enlarged(fit, response)
     return replace(fit, lever_arm_test=test)
 
 
@@ -196,10 +200,10 @@ def _jump_rates(fit: JointFit) -> Array:
 
 
 def _iterate(
-    model: Model, state: State, levels: Levels | None, *, dip: bool, lever_arm: bool, vps: VpsRecord | None
+    model: Model, state: State, levels: Levels | None, spent: int, *, dip: bool, lever_arm: bool, vps: VpsRecord | None
 ) -> tuple[JointFit, Array]:
     """Gauss–Newton with noise levels renewed at every step: the fit with the inverse information as covariance, and the
-    knots' response N_xx⁻¹N_xθ."""
+    knots' response N_xx⁻¹N_xθ. `spent` iterations came before."""
     layout, p = layout_of(model, state.values, dip=dip, lever_arm=lever_arm)
     knots, prior = model.knots, _Prior.at(model, state, layout, p)
     probe = Probe.draw(knots, model.readings.t, model.at, 3 * len(model.rows))
@@ -237,7 +241,7 @@ def _iterate(
         settled = max(unsettled, float(np.max(np.abs(change) / claimed))) < SETTLED
         if settled or float(np.max(np.abs(change))) < ROUNDING:
             plain = inverse_information(information)
-            fit = JointFit(model, state, path, levels, weight, layout, plain, information, iteration, vps=vps)
+            fit = JointFit(model, state, path, levels, weight, layout, plain, information, spent + iteration, vps=vps)
             return fit, eliminated[:, :, :p]
     raise EstimationError(
         "joint_diverged",

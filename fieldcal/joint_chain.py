@@ -11,6 +11,7 @@ record's length.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import expm, solve_continuous_lyapunov
@@ -129,13 +130,14 @@ def chain_solve(diagonal: Array, below: Array, right: Array) -> Array:
     `joint_singular`."""
     if len(diagonal) == 1:
         return np.asarray(_inverse(diagonal) @ right)
-    odd, before, after = diagonal[1::2], below[0::2], below[1::2]  # an odd knot below the even before it; the next below
+    # An odd knot is below the even one before it, and the next even one below that.
+    odd, before, after = diagonal[1::2], below[0::2], below[1::2]
     even, rest, between = np.empty_like(diagonal[0::2]), np.empty_like(right[0::2]), np.empty_like(after)
     even[0], rest[0] = diagonal[0], right[0]
     back, forth, solved = np.empty_like(before), np.empty_like(after), np.empty_like(right)
     own = solved[1::2]
     ends = [*range(0, len(odd), RUN), len(odd)]
-    runs = [(slice(a, b), slice(a + 1, b + 1)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    runs = [(slice(a, b), slice(a + 1, b + 1)) for a, b in pairwise(ends)]
     for run, following in runs:
         inverse, up, down = _inverse(odd[run]), before[run].transpose(0, 2, 1), after[run]
         back[run], own[run] = inverse @ before[run], inverse @ right[1::2][run]

@@ -21,7 +21,7 @@ from fieldcal.rotation import (
     to_rotation_vector,
 )
 
-CHUNK_ROWS = 8192
+CHUNK_ROWS = 512  # a few megabytes with all that is made of them: what a core holds in its cache
 RATE_SIDE_S = 0.03
 ACCELERATION = slice(3, 6)  # of a knot's translation
 SENSED = np.array([0, 1, 2, 6, 7, 8])  # of a knot's states: attitude and acceleration
@@ -86,9 +86,8 @@ def lever_arm_geometry(model: Model, state: State, own: slice) -> Array:
     scale = scaled[:3] / gyro.spread
     low_passed, change = np.take(model.readings.turning, model.at[own], axis=1)
     rate = scale * (low_passed - gyro.centre) + scaled[3:]
-    geometry = skew(scale * change) + rate[:, :, None] * rate[:, None, :]
-    geometry[:, range(3), range(3)] -= np.sum(rate**2, axis=1)[:, None]
-    return np.asarray(geometry)
+    turn = skew(rate)
+    return np.asarray(skew(scale * change) + turn @ turn)
 
 
 def residuals(model: Model, state: State, path: Trajectory) -> Array:
@@ -128,7 +127,7 @@ def _sensed_at_once(model: Model, state: State, own: slice, turn: Array, name: s
     """The same of a triad without a delay of its own."""
     if name == "magnetometer":
         vector = model.field(float(state.values["dip"][0]))[0]
-        return turn @ vector, vector
+        return np.einsum("nij,j->ni", turn, vector), vector
     sign, g = np.sign(model.readings.gravity_mps2), abs(model.readings.gravity_mps2)
     knots = model.knots
     k, share = knots.of_sample[model.at[own]], knots.share[model.at[own], None]
@@ -138,7 +137,7 @@ def _sensed_at_once(model: Model, state: State, own: slice, turn: Array, name: s
     sensed = np.einsum("nij,nj->ni", turn, vector)
     arm = state.values["lever_arm"]
     if arm.any():
-        sensed = sensed - sign * (lever_arm_geometry(model, state, own) @ arm)
+        sensed = sensed - sign * np.einsum("nij,j->ni", lever_arm_geometry(model, state, own), arm)
     return sensed, vector
 
 
