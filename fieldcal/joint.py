@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fieldcal import joint_start
 from fieldcal.bias_walk import bias_walk
 from fieldcal.errors import EstimationError
 from fieldcal.joint_chain import (
@@ -48,6 +49,7 @@ from fieldcal.rotation import Array, body_from_inertial
 LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
 BURST_ROUNDS = 3  # how often the fit looks for passing fields in what it left of the magnetometer
 MAX_ITERATIONS = 50
+ASTRAY = 20  # iterations after which a fit that has not settled starts anew from the constants reached
 # Settled: every step below this part of what one could claim as standard deviation, every noise level below it too.
 SETTLED = 0.1
 ROUNDING = 1e-8  # of centred parameters, which are of order one: nothing left to gain
@@ -211,6 +213,11 @@ def _iterate(
     residual = residuals(model, state, path)
     levels = levels or first_levels(model, state, path, residual)
     for iteration in range(1, MAX_ITERATIONS + 1):
+        if iteration == ASTRAY:
+            state = joint_start.anew(model, state)
+            path = trajectory(model, state)
+            residual = residuals(model, state, path)
+            levels = first_levels(model, state, path, residual)
         weight = robust_weight(model, residual, levels)
         normal, joints, reaction = linearised(model, state, path, layout, p, weight, levels, probe, vps)
         prior.add(normal, state, layout)

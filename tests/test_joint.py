@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from fieldcal import joint_model, joint_start
-from fieldcal.errors import EstimationError, UnusableFlight
+from fieldcal.errors import UnusableFlight
 from fieldcal.joint import JointFit, fit_joint
 from fieldcal.joint_record import TRIADS, Readings
 from fieldcal.rotation import angle_between
@@ -163,13 +163,9 @@ def test_what_is_beyond_the_model_widens_the_sd() -> None:
         r = simulate(
             seed=seed, **MOVING, dip_rad=np.radians(65.0), magnetic_bursts=4, gyro_random_walk=WALK, lost_share=0.01
         )
-        try:
-            fit = fitted(r)
-        except EstimationError:  # refused, as the pipeline does
-            continue
+        fit = fitted(r)
         far += [np.abs(normalised_errors(r, fit)) > 3.0, np.abs(normalised_zeros(r, fit)) > 3.0]
         walks.append(fit.bias_walk)
-    assert len(walks) >= 6
     assert np.mean(far) <= 0.05
     assert 0.5 * WALK < np.sqrt(np.mean(np.square(walks))) < 1.5 * WALK
 
