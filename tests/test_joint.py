@@ -26,6 +26,8 @@ ATTITUDE_DEG = 0.9
 # Error ÷ sd that one of nine scales on each of six flights passes by chance once in a hundred (normal, Bonferroni).
 FARTHEST = 3.9
 WALK = 0.002  # rad/s/√s
+# What is settled has to be so to half the sd when a record is four times as long: an iteration or two.
+MORE_ITERATIONS = 2
 SEEDS = (11, 12, 13, 14, 15, 16)
 
 
@@ -102,8 +104,7 @@ def test_noise_free_truth_is_recovered() -> None:
     assert not fit.state.values["lever_arm"].any()
 
 
-def test_every_row_counts_in_one_interval(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(joint_model, "CHUNK_ROWS", 500)
+def test_every_row_counts_in_one_interval() -> None:
     given = readings(simulate(duration_s=20.0, sets=1, seed=1))
     model, _ = joint_start.prepare(given, own_start(given, Experiment()))
     sums = np.zeros((len(model.knots.index), 1))
@@ -126,6 +127,11 @@ def test_translation_and_an_unknown_lever_arm_cost_little(moving: list[tuple[Rec
     assert np.median([np.degrees(rms(angle_between(fit.path.q, r.q))) for r, fit in moving]) < ATTITUDE_DEG
     for _, fit in moving:
         assert "lever_arm" in fit.layout
+
+
+def test_a_longer_record_takes_hardly_more_iterations(moving: list[tuple[Recording, JointFit]]) -> None:
+    longer = fitted(simulate(seed=SEEDS[0], duration_s=160.0, sets=12, vps=False, **MOVING))
+    assert longer.iterations <= max(fit.iterations for _, fit in moving) + MORE_ITERATIONS
 
 
 def test_scales_and_lever_arm_are_not_drawn_towards_nothing(moving: list[tuple[Recording, JointFit]]) -> None:
