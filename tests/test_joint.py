@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from fieldcal import joint_start
-from fieldcal.errors import UnusableFlight
+from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.joint import JointFit, fit_joint
 from fieldcal.joint_record import TRIADS, Readings
 from fieldcal.rotation import angle_between
@@ -189,6 +189,15 @@ def test_one_vector_triad_suffices_with_a_known_unit() -> None:
         assert missing not in fit.layout
         assert rms(relative_errors(r, fit, name)) < 0.02
         assert rms(relative_errors(r, fit, "gyroscope")) < 0.02
+
+
+def test_motion_about_one_axis_is_refused_by_name() -> None:
+    r = simulate(seed=9, turned=(0.0, 0.0, 1.0))
+    model, start = joint_start.prepare(readings(r), {name: truth(r, name) for name in TRIADS})
+    with pytest.raises(EstimationError, match="gyroscope x, gyroscope y, ") as error:
+        fit_joint(model, start)
+    assert error.value.reason_code == "axis_not_turned"
+    assert "gyroscope z" not in error.value.measured["still"]
 
 
 def test_no_start_is_refused() -> None:
