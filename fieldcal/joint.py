@@ -45,6 +45,7 @@ from fieldcal.joint_record import CROSS, TRIADS, Model, State, off_diagonal
 from fieldcal.joint_scores import integrated_translation, logged_units, within_intervals
 from fieldcal.joint_vps import VpsRecord
 from fieldcal.rotation import Array, body_from_inertial
+from fieldcal.statistics import white_noise_sigma
 
 LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
 BURST_ROUNDS = 3  # how often the fit looks for passing fields in what it left of the magnetometer
@@ -53,6 +54,7 @@ ASTRAY = 20  # iterations after which a fit that has not settled starts anew fro
 # Settled: every step below this part of what one could claim as standard deviation, every noise level below it too.
 SETTLED = 0.1
 ROUNDING = 1e-8  # of centred parameters, which are of order one: nothing left to gain
+STILL = 0.4  # part of an axis' readings, rms, that sample-to-sample noise is where nothing else can be told of it
 # Wald test of the lever arm, χ²₃: passed by chance once in a thousand.
 LEVER_ARM_GATE = 16.3
 # What is believed before the first reading: relative sd of scales, and of biases in units of the sensed range.
@@ -136,7 +138,7 @@ def fit_joint(
     Raises
     ------
     EstimationError
-        `joint_singular`, `joint_diverged`.
+        `joint_singular`, `joint_diverged`, `axis_not_turned`.
 
     Notes
     -----
@@ -250,10 +252,27 @@ def _iterate(
             plain = inverse_information(information)
             fit = JointFit(model, state, path, levels, weight, layout, plain, information, spent + iteration, vps=vps)
             return fit, eliminated[:, :, :p]
-    raise EstimationError(
+    raise _no_minimum(model, iteration)
+
+
+def _no_minimum(model: Model, iterations: int) -> EstimationError:
+    """Why there is none: axes that show hardly anything but noise, if there are such, or else the readings."""
+    still = [
+        f"{name} {'xyz'[axis]}"
+        for name, triad in model.triads.items()
+        for axis in np.flatnonzero(white_noise_sigma(triad.x[triad.known]) > STILL)
+    ]
+    if still:
+        return EstimationError(
+            "axis_not_turned",
+            f"The joint estimate found no minimum: {', '.join(still)} read hardly more than noise. Add 60° either way"
+            " about every axis.",
+            {"iterations": iterations, "still": still},
+        )
+    return EstimationError(
         "joint_diverged",
         "The joint estimate found no minimum: the readings contradict each other or the start is too far off.",
-        {"iterations": iteration},
+        {"iterations": iterations},
     )
 
 

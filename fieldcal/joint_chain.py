@@ -33,13 +33,15 @@ WEAK = 1e-2  # 1/rad²: keeps directions that nothing observes (heading without 
 class Knots:
     """Where the chain is tied: `index` (K,) sample of each knot; `of_sample` (n,) the knot at or before each sample;
     `share` (n,) of the interval gone by there; `joined` (K−1,) whether neighbours belong to one contiguous segment;
-    `interval_s` (K−1,) between them (1 where not joined); `motion` the translation's process per interval."""
+    `interval_s` (K−1,) between them (1 where not joined); `sample_s` between samples, median; `motion` the
+    translation's process per interval."""
 
     index: np.ndarray
     of_sample: np.ndarray
     share: Array
     joined: np.ndarray
     interval_s: Array
+    sample_s: float
     motion: Motion
 
 
@@ -69,7 +71,7 @@ def place_knots(t: Array, segment: np.ndarray, spacing_s: float) -> Knots:
     interval = np.where(joined, t[knot[1:]] - t[knot[:-1]], 1.0)
     of_sample = np.searchsorted(knot, np.arange(n), side="right") - 1
     share = (t - t[knot[of_sample]]) / np.r_[interval, 1.0][of_sample]
-    return Knots(knot, of_sample, share, joined, interval, _motion(interval))
+    return Knots(knot, of_sample, share, joined, interval, float(np.median(np.diff(t))), _motion(interval))
 
 
 def _motion(interval_s: Array) -> Motion:
@@ -133,7 +135,7 @@ def chain_solve(diagonal: Array, below: Array, right: Array) -> Array:
     # An odd knot is below the even one before it, and the next even one below that.
     odd, before, after = diagonal[1::2], below[0::2], below[1::2]
     even, rest, between = np.empty_like(diagonal[0::2]), np.empty_like(right[0::2]), np.empty_like(after)
-    even[0], rest[0] = diagonal[0], right[0]
+    even[0], rest[0] = diagonal[0], right[0]  # a run begins with the even knot that the one before it ended with
     back, forth, solved = np.empty_like(before), np.empty_like(after), np.empty_like(right)
     own = solved[1::2]
     ends = [*range(0, len(odd), RUN), len(odd)]

@@ -116,7 +116,7 @@ def _sensed(
 def _slow_rate(model: Model, path: Trajectory, own: slice) -> Array:
     """Running mean of the rate over 2 RATE_SIDE_S at rows `own`, (m, 3): the gyroscope's noise would be the delay's."""
     at = model.at[own]
-    side = max(1, round(RATE_SIDE_S / float(np.median(np.diff(model.readings.t)))))
+    side = max(1, round(RATE_SIDE_S / model.knots.sample_s))
     first, last = max(int(at[0]) - side, 0), min(int(at[-1]) + side + 1, len(path.rate))
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(path.rate[first:last], axis=0)])
     low, high = np.maximum(at - side - first, 0), np.minimum(at + side + 1 - first, len(total) - 1)
@@ -152,9 +152,11 @@ def chunks(model: Model) -> Iterator[tuple[slice, slice]]:
     starts = np.searchsorted(model.at, model.knots.index)  # first row of every interval
     first = 0
     while first < len(starts):
-        last = max(int(np.searchsorted(starts, starts[first] + CHUNK_ROWS)), first + 1)
-        end = len(model.at) if last >= len(starts) else int(starts[last])
-        yield slice(int(starts[first]), end), slice(first, min(last, len(starts)))
+        last = int(np.searchsorted(starts, starts[first] + CHUNK_ROWS))
+        if last == len(starts) or starts[last] == len(model.at):  # knots after the last row go with it
+            last = len(starts)
+        end = len(model.at) if last == len(starts) else int(starts[last])
+        yield slice(int(starts[first]), end), slice(first, last)
         first = last
 
 
@@ -247,7 +249,8 @@ def accumulate(
     p, (m, r) = len(normal.parameters), weight.shape
     root = np.sqrt(weight)
     share = model.knots.share[model.at[rows.own], None, None]
-    met = np.empty((m + 1, r, 12 + p + 4 + 2))
+    # Columns: pull at the knot before and after, parameters, residual, turns about the body's axes, both probes.
+    met = np.empty((m + 1, r, 6 + 6 + p + 1 + 3 + 2))
     met[m] = 0.0  # one row of nothing, to fill shorter intervals with
     before, after, given, drawn = np.split(met[:m], [6, 12, 16 + p], axis=2)
     np.multiply(rows.by_knot, root[..., None], out=before)

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from fieldcal import joint_model, joint_start
-from fieldcal.errors import UnusableFlight
+from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.joint import JointFit, fit_joint
 from fieldcal.joint_record import TRIADS, Readings
 from fieldcal.rotation import angle_between
@@ -104,14 +104,18 @@ def test_noise_free_truth_is_recovered() -> None:
     assert not fit.state.values["lever_arm"].any()
 
 
-def test_every_row_counts_in_one_interval() -> None:
+def test_every_row_counts_in_one_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     given = readings(simulate(duration_s=20.0, sets=1, seed=1))
     model, _ = joint_start.prepare(given, own_start(given, Experiment()))
-    sums = np.zeros((len(model.knots.index), 1))
-    for rows, ties in joint_model.chunks(model):
-        sums[ties] = joint_model.sums_by_interval(model, np.ones((rows.stop - rows.start, 1)), rows, ties)
     knot = np.searchsorted(model.knots.index, model.at, side="right") - 1
-    assert np.array_equal(sums[:, 0], np.bincount(knot, minlength=len(sums)))
+    assert model.at[-1] < model.knots.index[-1]  # the last knot has no rows: no run is of it alone
+    for most in range(115, 130):
+        monkeypatch.setattr(joint_model, "CHUNK_ROWS", most)
+        sums = np.zeros((len(model.knots.index), 1))
+        for rows, ties in joint_model.chunks(model):
+            assert rows.stop > rows.start
+            sums[ties] = joint_model.sums_by_interval(model, np.ones((rows.stop - rows.start, 1)), rows, ties)
+        assert np.array_equal(sums[:, 0], np.bincount(knot, minlength=len(sums)))
 
 
 @pytest.fixture(scope="module")
@@ -206,6 +210,15 @@ def test_one_vector_triad_suffices_with_a_known_unit() -> None:
         assert missing not in fit.layout
         assert rms(relative_errors(r, fit, name)) < 0.02
         assert rms(relative_errors(r, fit, "gyroscope")) < 0.02
+
+
+def test_motion_about_one_axis_is_refused_by_name() -> None:
+    r = simulate(seed=9, turned=(0.0, 0.0, 1.0))
+    model, start = joint_start.prepare(readings(r), {name: truth(r, name) for name in TRIADS})
+    with pytest.raises(EstimationError, match="gyroscope x, gyroscope y, ") as error:
+        fit_joint(model, start)
+    assert error.value.reason_code == "axis_not_turned"
+    assert "gyroscope z" not in error.value.measured["still"]
 
 
 def test_no_start_is_refused() -> None:
