@@ -70,9 +70,9 @@ def renewed_levels(
     count = weight.sum(axis=0)
     left = np.maximum(count - levels.colour * absorbed, 0.05 * count)
     variance = np.maximum(np.sum(weight * residual**2, axis=0) / left, LEAST_VARIANCE)
-    # Upwards the fixed point; downwards halfway to Newton's method, whose steps follow a variance to nothing.
+    # Upwards the fixed point; downwards Newton's method, bounded: it gets to nothing where there is nothing.
     square, free, information = np.maximum(squares.T, 1e-9)
-    number = np.where(square < free, np.sqrt(free * np.minimum(information, free)), free)
+    number = np.where(square < free, np.minimum(information, free), free)
     ratio = np.clip(1.0 + (square - free) / number, LEAST_RATIO, MOST_RATIO)
     walk, strength = levels.walk * ratio[0], levels.strength * np.sqrt(ratio[1])
     return Levels(
