@@ -304,10 +304,11 @@ def _padded(model: Model, own: slice, ties: slice) -> np.ndarray:
 def sums_by_interval(model: Model, x: Array, own: slice, ties: slice) -> Array:
     """Sums of the rows x (m, c) of a chunk over each of its intervals, (knots, c)."""
     starts = np.searchsorted(model.at[own], model.knots.index[ties])
-    empty = np.diff(np.r_[starts, len(x)]) == 0
-    sums = np.add.reduceat(x, np.minimum(starts, len(x) - 1), axis=0)
-    sums[empty] = 0.0
-    return np.asarray(sums)
+    sums = np.zeros((len(starts), *x.shape[1:]))
+    begun = starts < len(x)  # the others have no rows, and nothing for `reduceat` to stop the one before at
+    sums[begun] = np.add.reduceat(x, starts[begun], axis=0)
+    sums[np.diff(np.r_[starts, len(x)]) == 0] = 0.0
+    return sums
 
 
 def layout_of(

@@ -23,7 +23,7 @@ START_CUTOFF_HZ = 4.0
 WINDOWS = ((0.2, 1.5), (0.07, 4.5), (0.02, 15.0))
 TRUST = 0.1  # relative; a field that far off its own mean has half the weight
 # Rates for the lever arm: their derivative's noise would shrink it (a regressor), so no more than the motion needs.
-LEVER_ARM_CUTOFF_HZ, LEVER_ARM_SIDE_S = 1.5, 1.0
+LEVER_ARM_CUTOFF_HZ, LEVER_ARM_SIDE_S = 1.5, 4.0
 
 Constants = tuple[Array, Array]
 

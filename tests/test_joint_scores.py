@@ -1,0 +1,306 @@
+"""Corrections of the joint estimator's gradient: scores without bias at the truth, and traces of matrices written out.
+
+Around one known path noise is drawn in pairs of opposite sign, of which the mean score keeps only what is quadratic in
+noise: the bias, and nothing of the error that a maximum-likelihood estimate has by right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.linalg import expm, solve_continuous_lyapunov
+
+from fieldcal.gyro_output import propagate_stretches
+from fieldcal.joint import linearised
+from fieldcal.joint_chain import BRIDGE, GRADIENT, MOTION_HZ, SENSORS, Probe, place_knots
+from fieldcal.joint_model import layout_of, residuals, trajectory
+from fieldcal.joint_noise import Levels
+from fieldcal.joint_record import TRIADS, Model, Readings, State
+from fieldcal.joint_scores import integrated_translation, logged_units, within_intervals
+from fieldcal.joint_start import SPACING_S, turning
+from fieldcal.rotation import Array, body_from_inertial
+from fieldcal.simulate import NOISE_VARIANCE, SCALE, Experiment, Motion
+from tests.numerics_support import turning_rates
+
+RATE_HZ, GRAVITY_MPS2, DIP_RAD = 185.0, 9.81, 0.0
+STRENGTH_MPS2 = 0.3 / np.sqrt(3.0)  # of the translation, an axis
+FIELD_NED = np.array([np.cos(DIP_RAD), 0.0, np.sin(DIP_RAD)])
+AVERAGED = 3  # readings of a vector triad to a row, as `averaging_side` has it for this turning
+CORRECTIONS = ("logged_units", "within_intervals", "integrated_translation")
+# Gauss–Newton steps of the attitudes and the translation from the truth, constants held.
+STEPS = 3
+# Mean ÷ its standard error that one of twelve passes by chance once in a thousand (normal, Bonferroni); and "far".
+BY_CHANCE, FAR = 3.9, 8.0
+# How far, in its sd, a flight's scale is drawn off: at most, by the attitude's error in second order; at least, without
+# a correction.
+UNBIASED, WRONG = 0.3, 0.5
+SHARP = 0.03  # standard error of a mean over probes, relative
+WHOLE_MS = 1e-3  # relative: intervals are rounded to whole milliseconds for the translation
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A smooth path with exact readings of it, and the levels of the noise that is drawn around it."""
+
+    model: Model
+    state: State
+    levels: Levels
+    sigma: dict[str, float]
+
+    @classmethod
+    def of(cls, t: Array, rate: Array, *, gyro_noise: float = 1.0) -> Flight:
+        """Of body rates (n, 3) at t (n,), with the paper's noise, that of the gyroscope times `gyro_noise`."""
+        segment = np.zeros(len(t), dtype=np.int64)
+        q = propagate_stretches(t, rate, segment)
+        turn = body_from_inertial(q)
+        sensed = {
+            "gyroscope": rate,
+            "accelerometer": turn @ np.array([0.0, 0.0, GRAVITY_MPS2]),
+            "magnetometer": turn @ FIELD_NED,
+        }
+        logged = {name: x / np.array(SCALE[name]) for name, x in sensed.items()}
+        given = Readings(
+            t=t,
+            segment=segment,
+            **logged,
+            gravity_mps2=GRAVITY_MPS2,
+            field_ned=FIELD_NED,
+            turning=turning(t, segment, logged["gyroscope"]),
+        )
+        knots = place_knots(t, segment, SPACING_S)
+        model = Model.of(given, knots, side=AVERAGED // 2)
+        triads = {name: replace(own, x=(logged[name] - own.centre) / own.spread) for name, own in model.triads.items()}
+        rows = {name: replace(triads[name], x=triads[name].x[model.at]) for name in model.rows}
+        model = replace(model, triads={**triads, **rows})
+        values = {name: triads[name].scaled(np.array(SCALE[name]), np.zeros(3)) for name in TRIADS}
+        state = State(
+            q[knots.index],
+            np.zeros((len(knots.index), 9)),
+            {**values, "dip": np.array([DIP_RAD]), "lever_arm": np.zeros(3)},
+        )
+        sigma = {name: float(np.sqrt(variance)) for name, variance in NOISE_VARIANCE.items()}
+        sigma["gyroscope"] *= gyro_noise
+        sigma |= {name: sigma[name] / np.sqrt(AVERAGED) for name in model.rows}
+        variance = np.concatenate([(sigma[name] / values[name][:3]) ** 2 for name in model.rows])
+        walk = sigma["gyroscope"] ** 2 / RATE_HZ
+        return cls(model, state, Levels(variance, np.ones(len(variance)), walk, STRENGTH_MPS2), sigma)
+
+    def drawn(self, rng: np.random.Generator) -> list[tuple[Model, State]]:
+        """The flight with noise and a translation, and with both of them turned round; each with its true state."""
+        knots, model = self.model.knots, self.model
+        y = translation(rng, knots.interval_s) * STRENGTH_MPS2
+        noise = {name: rng.normal(size=x.x.shape) * self.sigma[name] for name, x in model.triads.items()}
+        at, a = knots.of_sample[model.at], y[:, 1]
+        share = knots.share[model.at, None]
+        moved = (1.0 - share) * a[at] + share * a[np.minimum(at + 1, len(a) - 1)]
+        q = trajectory(model, self.state).q[model.at]
+        noise["accelerometer"] -= np.einsum("nij,nj->ni", body_from_inertial(q), moved)
+        out = []
+        for sign in (1.0, -1.0):
+            triads = {
+                name: replace(x, x=x.x + sign * noise[name] / self.state.values[name][:3])
+                for name, x in model.triads.items()
+            }
+            out.append((replace(model, triads=triads), replace(self.state, motion=sign * y.reshape(len(y), 9))))
+        return out
+
+
+def stamps(duration_s: float) -> Array:
+    return np.asarray(np.arange(round(duration_s * RATE_HZ)) / RATE_HZ)
+
+
+def process() -> tuple[Array, Array]:
+    """Rate matrix and stationary covariance of (ω0 v, a, j/ω0), unit variance of a: three equal low-passes of v."""
+    omega = 2.0 * np.pi * MOTION_HZ * np.sqrt(2.0)
+    rate = omega * np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, -3.0, -3.0]])
+    stationary = solve_continuous_lyapunov(rate, -np.diag([0.0, 0.0, 1.0]))
+    return rate, stationary / stationary[1, 1]
+
+
+def translation(rng: np.random.Generator, interval_s: Array) -> Array:
+    """States (K, 3, 3) at knots, rows (ω0 v, a, j/ω0), unit variance of a."""
+    rate, stationary = process()
+    y = [np.linalg.cholesky(stationary) @ rng.normal(size=(3, 3))]
+    lengths, which = np.unique(np.round(interval_s, 6), return_inverse=True)
+    carried = [expm(rate * length) for length in lengths]
+    driven = [np.linalg.cholesky(stationary - f @ stationary @ f.T) for f in carried]
+    for k in which:
+        y.append(carried[k] @ y[-1] + driven[k] @ rng.normal(size=(3, 3)))
+    return np.array(y)
+
+
+def scores(
+    flight: Flight, model: Model, state: State, probe: Probe, *, steps: int = STEPS
+) -> tuple[Array, Array, Array]:
+    """Gradient (p,) of the quadratic form at the true constants, the three corrections (3, p), the information."""
+    layout, p = layout_of(model, state.values, dip=True, lever_arm=False)
+    weight = np.ones((len(model.at), len(flight.levels.variance)))
+    for step in range(steps):
+        path = trajectory(model, state)
+        normal, _, reaction = linearised(model, state, path, layout, p, weight, flight.levels, probe, None)
+        eliminated, information, gradient = normal.eliminate()
+        if step + 1 < steps:
+            state = state.moved(eliminated[:, :, p + GRADIENT], np.zeros(p), layout)
+    added = np.zeros((3, p))
+    walk = flight.levels.walk
+    added[0, layout["gyroscope"]][:3] = logged_units(model, state, path, walk)
+    added[1] = walk * within_intervals(model, state, layout, reaction, eliminated[:, :, p + BRIDGE])
+    added[2, layout["accelerometer"]][:3] = integrated_translation(
+        model, state, reaction, eliminated[:, :, p + SENSORS]
+    )
+    return gradient[:, GRADIENT], added, information
+
+
+def biases(flight: Flight, pairs: int) -> tuple[Array, Array, Array]:
+    """Of pairs of opposite noise: mean gradient (pairs, p), corrections (pairs, 3, p); the information (p, p)."""
+    rng, model = np.random.default_rng(2), flight.model
+    gradient, added = [], []
+    for pair in range(pairs):
+        probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.rows), seed=pair)
+        both = [scores(flight, *drawn, probe) for drawn in flight.drawn(rng)]
+        gradient.append(0.5 * (both[0][0] + both[1][0]))
+        added.append(0.5 * (both[0][1] + both[1][1]))
+    return np.array(gradient), np.array(added), both[0][2]
+
+
+def scales(flight: Flight, *names: str) -> np.ndarray:
+    """Where the triads' scales stand in θ."""
+    layout = layout_of(flight.model, flight.state.values, dip=True, lever_arm=False)[0]
+    return np.concatenate([np.arange(3) + layout[name].start for name in names])
+
+
+def over_error(x: Array) -> Array:
+    """Mean of the draws x (n, c) over its standard error."""
+    return np.asarray(x.mean(axis=0) / (x.std(axis=0, ddof=1) / np.sqrt(len(x))))
+
+
+def slopes(changed: Callable[[Array], tuple[Array, Array]], size: int, step: float) -> tuple[Array, Array]:
+    """∂(residuals, jumps)/∂(size numbers), (·, size), by central differences."""
+    columns = []
+    for i in range(size):
+        move = step * np.eye(size)[i]
+        columns.append([(a - b).ravel() / (2.0 * step) for a, b in zip(changed(move), changed(-move), strict=True)])
+    return np.array([c[0] for c in columns]).T, np.array([c[1] for c in columns]).T
+
+
+def at(model: Model, state: State) -> tuple[Array, Array]:
+    path = trajectory(model, state)
+    return residuals(model, state, path), path.jump
+
+
+@dataclass(frozen=True)
+class Dense:
+    """Everything as matrices: `free` (N, N) is V⁻¹ with the attitudes eliminated, over rows; `translated` (N, N) the
+    rows' covariance by translation; `within` (3, N, N) that by gyroscope noise about each axis, knots held."""
+
+    free: Array
+    translated: Array
+    within: Array
+
+    @classmethod
+    def of(cls, flight: Flight) -> Dense:
+        model, state, levels = flight.model, flight.state, flight.levels
+        k, n = len(model.knots.index), len(model.readings.t)
+        none = np.zeros((k, 12))
+
+        def turned(x: Array) -> tuple[Array, Array]:
+            return at(model, state.moved(np.hstack([x.reshape(k, 3), none[:, 3:]]), np.zeros(0), {}))
+
+        def accelerated(x: Array) -> tuple[Array, Array]:
+            return at(model, replace(state, motion=np.hstack([none[:, :3], x.reshape(k, 3), none[:, :3]])))
+
+        def noisy(x: Array) -> tuple[Array, Array]:
+            gyro = model.triads["gyroscope"]
+            other = replace(gyro, x=gyro.x + x.reshape(n, 3) / state.values["gyroscope"][:3])
+            return at(replace(model, triads={**model.triads, "gyroscope": other}), state)
+
+        rows, jumps = slopes(turned, 3 * k, 1e-4)
+        by_motion = slopes(accelerated, 3 * k, 1e-2)[0]
+        by_noise = slopes(noisy, 3 * n, 1e-2)[0].reshape(len(rows), n, 3)
+        rate, stationary = process()
+        t = model.readings.t[model.knots.index]
+        memory = np.array([[(expm(rate * abs(a - b)) @ stationary)[1, 1] for a in t] for b in t])
+        translated = by_motion @ np.kron(memory * levels.strength**2, np.eye(3)) @ by_motion.T
+        noise = np.tile(levels.variance, len(model.at))
+        whole = np.diag(np.r_[noise, np.repeat(levels.walk * model.knots.interval_s, 3)])
+        whole[: len(rows), : len(rows)] += translated
+        sensed = np.vstack([rows, jumps])
+        solved = np.linalg.solve(whole, sensed)
+        free = np.linalg.inv(whole) - solved @ np.linalg.solve(sensed.T @ solved, solved.T)
+        within = np.array([x @ x.T for x in by_noise.transpose(2, 0, 1)]) * levels.walk * RATE_HZ
+        return cls(free[: len(rows), : len(rows)], translated, within)
+
+    def by_row(self, covariance: Array) -> Array:
+        """tr(E_j C V⁻¹…) of each sensor axis j (6,)."""
+        return np.asarray(np.einsum("ab,ba->a", covariance, self.free).reshape(-1, 6).sum(axis=0))
+
+
+@pytest.fixture(scope="module")
+def written_out() -> tuple[Flight, Dense]:
+    t = stamps(0.9)
+    flight = Flight.of(t, turning_rates(t, np.random.default_rng(1)))
+    return flight, Dense.of(flight)
+
+
+def test_integrated_translation_is_the_trace_written_out(written_out: tuple[Flight, Dense]) -> None:
+    """Probed by one row at a time, which is exact."""
+    flight, dense = written_out
+    model, state = flight.model, flight.state
+    probe = Probe.draw(model.knots, model.readings.t, model.at, 6)
+    found = np.zeros(3)
+    for row, axis in np.ndindex(len(model.at), 3):
+        one = np.zeros_like(probe.sensors)
+        one[row, axis] = 1.0
+        added = scores(flight, model, state, replace(probe, sensors=one), steps=1)[1]
+        found += added[2, scales(flight, "accelerometer")] * state.values["accelerometer"][:3]
+    assert np.abs(found / dense.by_row(dense.translated)[:3] - 1.0).max() < WHOLE_MS
+
+
+def test_within_intervals_is_on_average_the_traces_written_out(written_out: tuple[Flight, Dense]) -> None:
+    flight, dense = written_out
+    model, state = flight.model, flight.state
+    gyroscope = [dense.by_row(own).sum() for own in dense.within]
+    expected = np.concatenate([gyroscope, -dense.by_row(dense.within.sum(axis=0))])
+    own = scales(flight, *TRIADS)
+    scale = np.concatenate([state.values[name][:3] for name in TRIADS])
+    found = []
+    for seed in range(250):
+        probe = Probe.draw(model.knots, model.readings.t, model.at, 6, seed=seed)
+        found.append(scores(flight, model, state, probe, steps=1)[1][1, own] * scale)
+    apart = np.array(found) - expected
+    assert (apart.std(axis=0) / np.sqrt(len(apart)) < SHARP * np.abs(expected)).all()
+    assert np.abs(over_error(apart)).max() < BY_CHANCE
+
+
+def test_a_flight_at_the_paper_s_noise_is_unbiased_with_them_and_far_off_without_any_one() -> None:
+    t = stamps(40.0)
+    flight = Flight.of(t, Motion(Experiment(), np.random.default_rng(1)).rate(t))
+    gradient, added, information = biases(flight, 8)
+    sd = np.sqrt(np.diagonal(np.linalg.inv(information)))
+    scale = scales(flight, *TRIADS)
+
+    def bias(score: Array) -> Array:
+        return np.abs(np.linalg.solve(information, score.mean(axis=0)) / sd)[scale]
+
+    whole = gradient + added.sum(axis=1)
+    assert bias(whole).max() < UNBIASED
+    for i, name in enumerate(CORRECTIONS):
+        assert bias(whole - added[:, i]).max() > WRONG, name
+
+
+@pytest.mark.parametrize(
+    ("triad", "gyro_noise", "needed"),
+    [("gyroscope", 1.0, ("logged_units", "within_intervals")), ("accelerometer", 0.1, ("integrated_translation",))],
+)
+def test_the_score_of_a_triad_has_no_mean(triad: str, gyro_noise: float, needed: tuple[str, ...]) -> None:
+    """The accelerometer's with a steady gyroscope, where the attitude's own error is too small to shorten gravity."""
+    t = stamps(4.0)
+    flight = Flight.of(t, turning_rates(t, np.random.default_rng(1)), gyro_noise=gyro_noise)
+    gradient, added, _ = biases(flight, 40)
+    own = scales(flight, triad)
+    whole = (gradient + added.sum(axis=1))[:, own]
+    assert np.abs(over_error(whole)).max() < BY_CHANCE
+    for name in needed:
+        assert np.abs(over_error(whole - added[:, CORRECTIONS.index(name), own])).min() > FAR, name
