@@ -1,5 +1,9 @@
 """What the joint estimator's scores lack beside the quadratic form, as residuals are in logged units and noise is in
-the sensitivities too: corrections of the gradient on the triads' scales."""
+the sensitivities too: corrections of the gradient on the triads' scales.
+
+Without them the scales of a 40 s flight at the paper's noise are drawn off by up to nine of their standard deviations,
+with them by 0.2 at most. That rest is what the attitude's own error does in second order: it shortens the predicted
+vectors by its variance."""
 
 from __future__ import annotations
 
