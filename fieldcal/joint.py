@@ -41,7 +41,7 @@ from fieldcal.joint_noise import (
     unsettled_by,
 )
 from fieldcal.joint_record import CROSS, TRIADS, Model, State, off_diagonal
-from fieldcal.joint_scores import integrated_translation, logged_units, within_intervals
+from fieldcal.joint_scores import logged_units, within_intervals, without_translation
 from fieldcal.joint_vps import VpsRecord
 from fieldcal.rotation import Array, body_from_inertial
 
@@ -138,8 +138,8 @@ def fit_joint(
     Notes
     -----
     The likelihood is maximised over the attitudes, with every residual in logged units: that is consistent (a rate or
-    a length in SI units would shrink with its scale). Over the translation, which has a prior of its own, it is
-    integrated; what that adds to the accelerometer's gradient is `integrated_translation`.
+    a length in SI units would shrink with its scale). The translation, which has a prior of its own, is noise to the
+    accelerometer's scale (`without_translation`).
 
     It cannot see what moves all triads together with the body: a common rotation of the axes, or a field that turns
     with the vehicle other than hard iron.
@@ -217,7 +217,7 @@ def _iterate(
         gradient[:, GRADIENT] += within
         if "accelerometer" in layout:
             own = layout["accelerometer"].start + np.arange(3)
-            gradient[own, GRADIENT] += integrated_translation(model, state, reaction, eliminated[:, :, p + SENSORS])
+            gradient[own, GRADIENT] += without_translation(model, state, path, residual, _whitening(weight, levels))
         theta = solve_scaled(information, gradient)
         response = eliminated[:, :, p:] - eliminated[:, :, :p] @ theta
         step, change = response[:, :, GRADIENT], theta[:, GRADIENT]

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fieldcal.joint_model import SENSED, Trajectory
+from fieldcal.joint_model import SENSED, Trajectory, translation
 from fieldcal.joint_record import Model, State
 from fieldcal.rotation import Array, body_from_inertial
 
@@ -45,12 +45,16 @@ def within_intervals(
     return out
 
 
-def integrated_translation(model: Model, state: State, reaction: tuple[Array, Array], response: Array) -> Array:
-    """Gradient (3,) on the accelerometer's λ' from integrating over the translation instead of maximising over it.
+def without_translation(model: Model, state: State, path: Trajectory, residual: Array, whitening: Array) -> Array:
+    """Gradient (3,) on the accelerometer's λ' that keeps the translation out of it.
 
-    With V(λ) the logged readings' covariance, translation included, and H the attitudes' sensitivity, the score of a
-    likelihood maximised over the attitudes has the bias −½ tr[(HᵀV⁻¹H)⁻¹ HᵀV⁻¹ V_λ V⁻¹H]. Taken off, what is left
-    beside the quadratic form is tr_i/λ_i: the trace of row i's hat matrix that belongs to the translation."""
-    row = 3 * model.rows.index("accelerometer")
-    taken = np.einsum("kcr,kc->r", reaction[0][:, 3:, row : row + 3], response[:, SENSED[3:]])
-    return np.asarray(taken / state.values["accelerometer"][:3])
+    Translation is in the residuals and, as its estimate, in the vector predicted for them, and so in their sensitivity
+    to λ_i: the quadratic form's score is not zero at the truth. With gravity and lever arm alone in the sensitivity it
+    is, whatever spectrum and direction the translation has. (The likelihood integrated over the translation would take
+    off what its model expects of this, and gain the little that a translation as strong along all axes tells of λ.)"""
+    row = 3 * model.rows.index("accelerometer") + np.arange(3)
+    sensed = -np.sign(model.readings.gravity_mps2) * np.einsum(
+        "nij,nj->ni", body_from_inertial(path.q[model.at]), translation(model, state)
+    )
+    pulled = np.sum(sensed * whitening[:, row] * residual[:, row], axis=0)
+    return np.asarray(pulled / state.values["accelerometer"][:3] ** 2)
