@@ -41,7 +41,7 @@ from fieldcal.joint_noise import (
     unsettled_by,
 )
 from fieldcal.joint_record import CROSS, TRIADS, Model, State, off_diagonal
-from fieldcal.joint_scores import logged_units, within_intervals, without_translation
+from fieldcal.joint_scores import logged_units, within_intervals
 from fieldcal.joint_vps import VpsRecord
 from fieldcal.rotation import Array, body_from_inertial
 
@@ -138,8 +138,8 @@ def fit_joint(
     Notes
     -----
     The likelihood is maximised over the attitudes, with every residual in logged units: that is consistent (a rate or
-    a length in SI units would shrink with its scale). The translation, which has a prior of its own, is noise to the
-    accelerometer's scale (`without_translation`).
+    a length in SI units would shrink with its scale). Translation is noise to the accelerometer's scale, which is found
+    from gravity and lever arm alone: then no spectrum or direction of translation draws it off, whatever its prior.
 
     It cannot see what moves all triads together with the body: a common rotation of the axes, or a field that turns
     with the vehicle other than hard iron.
@@ -215,9 +215,6 @@ def _iterate(
         gradient[own, GRADIENT] += logged_units(model, state, path, levels.walk)
         within = levels.walk * within_intervals(model, state, layout, reaction, eliminated[:, :, p + BRIDGE])
         gradient[:, GRADIENT] += within
-        if "accelerometer" in layout:
-            own = layout["accelerometer"].start + np.arange(3)
-            gradient[own, GRADIENT] += without_translation(model, state, path, residual, _whitening(weight, levels))
         theta = solve_scaled(information, gradient)
         response = eliminated[:, :, p:] - eliminated[:, :, :p] @ theta
         step, change = response[:, :, GRADIENT], theta[:, GRADIENT]

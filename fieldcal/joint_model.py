@@ -182,8 +182,14 @@ def sensitivities(
             by_knot[:, row, :3] = gain * (turn @ skew(vector))
             by_parameter[:, row, by_gyroscope] = by_knot[:, row, :3] @ moved
             column = layout[name].start
+            # Translation, in the residuals too, would draw λ off: gravity and lever arm alone tell it.
+            steady = sensed
+            if name == "accelerometer":
+                steady = sensed + np.sign(model.readings.gravity_mps2) * np.einsum(
+                    "nij,nj->ni", turn, translation(model, state, own)
+                )
             for axis in range(3):
-                scaled = (sensed[:, axis] - constants[3 + axis]) / constants[axis]
+                scaled = (steady[:, axis] - constants[3 + axis]) / constants[axis]
                 by_parameter[:, 3 * i + axis, column + axis] = -known * scaled / constants[axis]
                 by_parameter[:, 3 * i + axis, column + 3 + axis] = -known / constants[axis]
             if f"{name}_cross" in layout:

@@ -1,9 +1,9 @@
 """What the joint estimator's scores lack beside the quadratic form, as residuals are in logged units and noise is in
 the sensitivities too: corrections of the gradient on the triads' scales.
 
-Without them the scales of a 40 s flight at the paper's noise are drawn off by up to nine of their standard deviations,
-with them by 0.2 at most. That rest is what the attitude's own error does in second order: it shortens the predicted
-vectors by its variance."""
+Without them the gyroscope's scales are drawn off by some standard deviations on a 40 s flight at the paper's noise;
+with them by 0.2 at most, which is what the attitude's own error does in second order: it shortens the predicted vectors
+by its variance."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fieldcal.joint_model import SENSED, Trajectory, translation
+from fieldcal.joint_model import SENSED, Trajectory
 from fieldcal.joint_record import Model, State
 from fieldcal.rotation import Array, body_from_inertial
 
@@ -43,18 +43,3 @@ def within_intervals(
         own = layout[name].start + np.arange(3)
         out[own] = (1.0 if i == 0 else -1.0) * left[3 * i : 3 * i + 3] / state.values[name][:3]
     return out
-
-
-def without_translation(model: Model, state: State, path: Trajectory, residual: Array, whitening: Array) -> Array:
-    """Gradient (3,) on the accelerometer's λ' that keeps the translation out of it.
-
-    Translation is in the residuals and, as its estimate, in the vector predicted for them, and so in their sensitivity
-    to λ_i: the quadratic form's score is not zero at the truth. With gravity and lever arm alone in the sensitivity it
-    is, whatever spectrum and direction the translation has. (The likelihood integrated over the translation would take
-    off what its model expects of this, and gain the little that a translation as strong along all axes tells of λ.)"""
-    row = 3 * model.rows.index("accelerometer") + np.arange(3)
-    sensed = -np.sign(model.readings.gravity_mps2) * np.einsum(
-        "nij,nj->ni", body_from_inertial(path.q[model.at]), translation(model, state)
-    )
-    pulled = np.sum(sensed * whitening[:, row] * residual[:, row], axis=0)
-    return np.asarray(pulled / state.values["accelerometer"][:3] ** 2)

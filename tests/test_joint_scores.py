@@ -1,4 +1,4 @@
-"""Corrections of the joint estimator's gradient: scores without bias at the truth, and traces of matrices written out.
+"""The joint estimator's gradient and its corrections: no bias at the truth, and traces of matrices written out.
 
 Around one known path noise is drawn in pairs of opposite sign, of which the mean score keeps only what is quadratic in
 noise: the bias, and nothing of the error that a maximum-likelihood estimate has by right."""
@@ -15,10 +15,10 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from fieldcal.gyro_output import propagate_stretches
 from fieldcal.joint import linearised
 from fieldcal.joint_chain import BRIDGE, GRADIENT, MOTION_HZ, Probe, place_knots
-from fieldcal.joint_model import layout_of, residuals, trajectory
+from fieldcal.joint_model import layout_of, residuals, trajectory, translation
 from fieldcal.joint_noise import Levels
 from fieldcal.joint_record import TRIADS, Model, Readings, State
-from fieldcal.joint_scores import logged_units, within_intervals, without_translation
+from fieldcal.joint_scores import logged_units, within_intervals
 from fieldcal.joint_start import SPACING_S, turning
 from fieldcal.rotation import Array, body_from_inertial
 from fieldcal.simulate import NOISE_VARIANCE, SCALE, Experiment, Motion
@@ -29,7 +29,7 @@ RATE_HZ, GRAVITY_MPS2, DIP_RAD = 185.0, 9.81, 0.0
 EVERY_WAY, UP_AND_DOWN = np.full(3, 0.3 / np.sqrt(3.0)), np.array([0.0, 0.0, 0.3])
 FIELD_NED = np.array([np.cos(DIP_RAD), 0.0, np.sin(DIP_RAD)])
 AVERAGED = 3  # readings of a vector triad to a row, as `averaging_side` has it for this turning
-CORRECTIONS = ("logged_units", "within_intervals", "without_translation")
+CORRECTIONS = ("logged_units", "within_intervals", "translation left out")
 # Gauss–Newton steps of the attitudes and the translation from the truth, constants held.
 STEPS = 3
 # Mean ÷ its standard error that one of twelve passes by chance once in a thousand (normal, Bonferroni); and "far".
@@ -93,7 +93,7 @@ class Flight:
     def drawn(self, rng: np.random.Generator) -> list[tuple[Model, State]]:
         """The flight with noise and a translation, and with both of them turned round; each with its true state."""
         knots, model = self.model.knots, self.model
-        y = translation(rng, knots.interval_s) * self.strength_mps2
+        y = drawn_translation(rng, knots.interval_s) * self.strength_mps2
         noise = {name: rng.normal(size=x.x.shape) * self.sigma[name] for name, x in model.triads.items()}
         at, a = knots.of_sample[model.at], y[:, 1]
         share = knots.share[model.at, None]
@@ -122,7 +122,7 @@ def process() -> tuple[Array, Array]:
     return rate, stationary / stationary[1, 1]
 
 
-def translation(rng: np.random.Generator, interval_s: Array) -> Array:
+def drawn_translation(rng: np.random.Generator, interval_s: Array) -> Array:
     """States (K, 3, 3) at knots, rows (ω0 v, a, j/ω0), unit variance of a."""
     rate, stationary = process()
     y = [np.linalg.cholesky(stationary) @ rng.normal(size=(3, 3))]
@@ -137,7 +137,8 @@ def translation(rng: np.random.Generator, interval_s: Array) -> Array:
 def scores(
     flight: Flight, model: Model, state: State, probe: Probe, *, steps: int = STEPS
 ) -> tuple[Array, Array, Array]:
-    """Gradient (p,) of the quadratic form at the true constants, the three corrections (3, p), the information."""
+    """Gradient (p,) at the true constants, what corrects it (3, p), the information (p, p). The last correction is in
+    the gradient already: the estimated translation's part of the accelerometer's sensitivity."""
     layout, p = layout_of(model, state.values, dip=True, lever_arm=False)
     weight = np.ones((len(model.at), len(flight.levels.variance)))
     for step in range(steps):
@@ -150,10 +151,10 @@ def scores(
     walk = flight.levels.walk
     added[0, layout["gyroscope"]][:3] = logged_units(model, state, path, walk)
     added[1] = walk * within_intervals(model, state, layout, reaction, eliminated[:, :, p + BRIDGE])
-    residual = residuals(model, state, path)
-    added[2, layout["accelerometer"]][:3] = without_translation(
-        model, state, path, residual, weight / flight.levels.variance
-    )
+    turn = body_from_inertial(path.q[model.at])
+    sensed = -np.einsum("nij,nj->ni", turn, translation(model, state)) / state.values["accelerometer"][:3]
+    pulled = np.sum(sensed * (residuals(model, state, path) / flight.levels.variance)[:, :3], axis=0)
+    added[2, layout["accelerometer"]][:3] = pulled / state.values["accelerometer"][:3]
     return gradient[:, GRADIENT], added, information
 
 
@@ -266,7 +267,7 @@ def test_a_flight_at_the_paper_s_noise_is_unbiased_with_them_and_far_off_without
     def bias(score: Array) -> Array:
         return np.abs(np.linalg.solve(information, score.mean(axis=0)) / sd)[scale]
 
-    whole = gradient + added.sum(axis=1)
+    whole = gradient + added[:, :2].sum(axis=1)
     assert bias(whole).max() < UNBIASED
     for i, name in enumerate(CORRECTIONS):
         assert bias(whole - added[:, i]).max() > WRONG, name
@@ -277,7 +278,7 @@ def test_the_gyroscope_s_score_has_no_mean() -> None:
     flight = Flight.of(t, turning_rates(t, np.random.default_rng(1)))
     own = scales(flight, "gyroscope")
     gradient, added, _ = biases(flight, 30)
-    whole = (gradient + added.sum(axis=1))[:, own]
+    whole = (gradient + added[:, :2].sum(axis=1))[:, own]
     assert np.abs(over_error(whole)).max() < BY_CHANCE
     for i in range(2):
         assert np.abs(over_error(whole - added[:, i, own])).min() > FAR, CORRECTIONS[i]
@@ -290,6 +291,6 @@ def test_the_accelerometer_s_score_has_no_mean_whichever_way_the_translation_goe
     flight = Flight.of(t, turning_rates(t, np.random.default_rng(1)), gyro_noise=0.1, strength_mps2=strength_mps2)
     own = scales(flight, "accelerometer")
     gradient, added, _ = biases(flight, 20)
-    whole = (gradient + added.sum(axis=1))[:, own]
+    whole = (gradient + added[:, :2].sum(axis=1))[:, own]
     assert np.abs(whole.mean(axis=0)).max() < SECOND_ORDER * np.abs(added[:, 2, own].mean(axis=0)).max()
     assert np.abs(over_error(whole - added[:, 2, own])).min() > FAR
