@@ -48,6 +48,9 @@ from fieldcal.rotation import Array, body_from_inertial
 LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
 BURST_ROUNDS = 3  # how often the fit looks for passing fields in what it left of the magnetometer
 MAX_ITERATIONS = 50
+# A step that takes back this part of the one before, and more, is cut to it: the slope lacks that of the gradient's
+# corrections, so that steps may be too long.
+TOO_FAR = 0.5
 # Settled: every step below this part of what one could claim as standard deviation, every noise level below it too.
 SETTLED = 0.1
 ROUNDING = 1e-8  # of centred parameters, which are of order one: nothing left to gain
@@ -206,6 +209,7 @@ def _iterate(
     path = trajectory(model, state)
     residual = residuals(model, state, path)
     levels = levels or first_levels(model, state, path, residual)
+    before = np.zeros(p)
     for iteration in range(1, MAX_ITERATIONS + 1):
         weight = robust_weight(model, residual, levels)
         normal, joints, reaction = linearised(model, state, path, layout, p, weight, levels, probe, vps)
@@ -219,6 +223,9 @@ def _iterate(
         response = eliminated[:, :, p:] - eliminated[:, :, :p] @ theta
         step, change = response[:, :, GRADIENT], theta[:, GRADIENT]
         least = _least_part(state, step, change, layout)
+        if change @ information @ before < -TOO_FAR * (before @ information @ before):
+            least *= TOO_FAR
+        before = least * change
         state = state.moved(least * step, least * change, layout)
         path = trajectory(model, state)
         residual = residuals(model, state, path)

@@ -2,7 +2,7 @@
 the sensitivities too: corrections of the gradient on the triads' scales.
 
 Without them the gyroscope's scales are drawn off by some standard deviations on a 40 s flight at the paper's noise;
-with them by 0.2 at most, which is what the attitude's own error does in second order: it shortens the predicted vectors
+with them by 0.1 at most, which is what the attitude's own error does in second order: it shortens the predicted vectors
 by its variance."""
 
 from __future__ import annotations

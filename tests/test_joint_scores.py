@@ -36,7 +36,7 @@ STEPS = 3
 BY_CHANCE, FAR = 3.9, 8.0
 # How far, in its sd, a flight's scale is drawn off: at most, by the attitude's error in second order; at least, without
 # a correction.
-UNBIASED, WRONG = 0.3, 0.5
+UNBIASED, WRONG = 0.15, 0.5
 SECOND_ORDER = 0.01  # the same of the attitude's error over what is corrected, with a steady gyroscope
 SHARP = 0.03  # standard error of a mean over probes, relative
 
