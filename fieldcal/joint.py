@@ -209,7 +209,7 @@ def _iterate(
     path = trajectory(model, state)
     residual = residuals(model, state, path)
     levels = levels or first_levels(model, state, path, residual)
-    before = np.zeros(p)
+    before: Array = np.zeros(p)
     for iteration in range(1, MAX_ITERATIONS + 1):
         weight = robust_weight(model, residual, levels)
         normal, joints, reaction = linearised(model, state, path, layout, p, weight, levels, probe, vps)
