@@ -6,13 +6,15 @@
 Prints one Markdown table: for every case and quantity the median / 95th percentile over flights. Scale errors are the
 rms of three axes, per cent; attitude is the rms angle, degrees, against the truth delayed by the sensor filter; "zero"
 is what the calibrated triad reads at the true zero; "beyond 3 sd" is the share of the 18 scales and zero offsets of
-accepted triads. The lever arm is unknown to both methods. `--speed` times the joint fit at 40 s, 10 min and 1 h.
+accepted triads. The lever arm is unknown to both methods. `--speed` times the joint fit at 40 s, 10 min and 1 h,
+with its memory.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+import tracemalloc
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -23,7 +25,7 @@ import polars as pl
 
 from fieldcal import joint_start
 from fieldcal.frames import AXES, QUATERNION, constants, matrix
-from fieldcal.joint import fit_joint
+from fieldcal.joint import JointFit, fit_joint
 from fieldcal.joint_record import Readings
 from fieldcal.pipeline import run_flight
 from fieldcal.results import StageResult
@@ -137,27 +139,36 @@ def print_table(case: str, figures: dict[str, Figures]) -> None:
 
 
 def speed() -> None:
-    """Process time of start and fit."""
-    print("| flight | joint fit, s | iterations | per minute of flight, s |\n|---|---|---|---|")
-    for duration_s, sets, repeats in ((40.0, 3, 5), (600.0, 45, 2), (3600.0, 270, 1)):
+    """Process time of start and fit, and the most that its arrays take beside the recording."""
+    print("| flight | joint fit, s | iterations | per minute of flight, s | memory, MB |\n|---|---|---|---|---|")
+    for duration_s, sets, repeats in ((40.0, 3, 9), (600.0, 45, 2), (3600.0, 270, 1)):
         r = simulate(duration_s=duration_s, sets=sets, seed=1, vps=False)
         results = run_flight(signals(r), settings(r.experiment)) if duration_s < 100 else None
-        segment = np.zeros(len(r.t), dtype=np.int64)
         best, iterations = np.inf, 0
         for _ in range(repeats):
             began = time.process_time()
-            readings = Readings(
-                t=r.t,
-                segment=segment,
-                **r.counts,
-                gravity_mps2=r.experiment.gravity_mps2,
-                field_ned=np.array([1.0, 0.0, 0.0]),
-                turning=joint_start.turning(r.t, segment, r.counts["gyroscope"]),
-            )
-            model, state = joint_start.prepare(readings, _start(r, readings, results))
-            iterations = fit_joint(model, state).iterations
+            iterations = _fit_alone(r, results).iterations
             best = min(best, time.process_time() - began)
-        print(f"| {duration_s:.0f} s | {best:.2f} | {iterations} | {best / duration_s * 60:.2f} |", flush=True)
+        tracemalloc.start()
+        _fit_alone(r, results)
+        memory = tracemalloc.get_traced_memory()[1] / 2**20
+        tracemalloc.stop()
+        cells = f"{duration_s:.0f} s | {best:.2f} | {iterations} | {best / duration_s * 60:.2f} | {memory:.0f}"
+        print(f"| {cells} |", flush=True)
+
+
+def _fit_alone(r: Recording, results: dict[str, StageResult] | None) -> JointFit:
+    """Start and fit of a recording, from the serial result where there is one."""
+    segment = np.zeros(len(r.t), dtype=np.int64)
+    readings = Readings(
+        t=r.t,
+        segment=segment,
+        **r.counts,
+        gravity_mps2=r.experiment.gravity_mps2,
+        field_ned=np.array([1.0, 0.0, 0.0]),
+        turning=joint_start.turning(r.t, segment, r.counts["gyroscope"]),
+    )
+    return fit_joint(*joint_start.prepare(readings, _start(r, readings, results)))
 
 
 def _start(

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fieldcal import joint_start
 from fieldcal.bias_walk import bias_walk
 from fieldcal.errors import EstimationError
 from fieldcal.joint_chain import (
@@ -44,6 +45,7 @@ from fieldcal.joint_record import CROSS, TRIADS, Model, State, off_diagonal
 from fieldcal.joint_scores import logged_units, within_intervals
 from fieldcal.joint_vps import VpsRecord
 from fieldcal.rotation import Array, body_from_inertial
+from fieldcal.statistics import white_noise_sigma
 
 LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
 BURST_ROUNDS = 3  # how often the fit looks for passing fields in what it left of the magnetometer
@@ -51,9 +53,11 @@ MAX_ITERATIONS = 50
 # A step that takes back this part of the one before, and more, is cut to it: the slope lacks that of the gradient's
 # corrections, so that steps may be too long.
 TOO_FAR = 0.5
+ASTRAY = 20  # iterations after which a fit that has not settled starts anew from the constants reached
 # Settled: every step below this part of what one could claim as standard deviation, every noise level below it too.
 SETTLED = 0.1
 ROUNDING = 1e-8  # of centred parameters, which are of order one: nothing left to gain
+STILL = 0.4  # part of an axis' readings, rms, that sample-to-sample noise is where nothing else can be told of it
 # Wald test of the lever arm, χ²₃: passed by chance once in a thousand.
 LEVER_ARM_GATE = 16.3
 # What is believed before the first reading: relative sd of scales, and of biases in units of the sensed range.
@@ -66,8 +70,9 @@ class JointFit:
     """The solution in centred coordinates; θ is ordered by `layout`.
 
     `covariance` (p, p) of θ, coloured-residual form; `information` (p, p) with the knots eliminated; `weight` (m, r)
-    robust weights; `bias_walk` of the gyroscope's bias, rad/s/√s, whose spread over the record is in its covariance;
-    `lever_arm_test` the Wald statistic (χ²₃) of a free lever arm, None where it was not tried."""
+    robust weights; `iterations` of all rounds; `bias_walk` of the gyroscope's bias, rad/s/√s, whose spread over the
+    record is in its covariance; `lever_arm_test` the Wald statistic (χ²₃) of a free lever arm, None where it was not
+    tried."""
 
     model: Model
     state: State
@@ -136,7 +141,7 @@ def fit_joint(
     Raises
     ------
     EstimationError
-        `joint_singular`, `joint_diverged`.
+        `joint_singular`, `joint_diverged`, `axis_not_turned`.
 
     Notes
     -----
@@ -148,13 +153,13 @@ def fit_joint(
     with the vehicle other than hard iron.
     """
     free = try_lever_arm and "accelerometer" in model.rows
-    fit, response = _iterate(model, start, levels, dip=free_dip, lever_arm=free, vps=vps)
+    fit, response = _iterate(model, start, levels, 0, dip=free_dip, lever_arm=free, vps=vps)
     for _ in range(BURST_ROUNDS):
         passing = passing_fields(fit.model, fit.weight)
         if not passing.any():
             break
         model = fit.model.without("magnetometer", passing)
-        fit, response = _iterate(model, fit.state, fit.levels, dip=free_dip, lever_arm=free, vps=vps)
+        fit, response = _iterate(model, fit.state, fit.levels, fit.iterations, dip=free_dip, lever_arm=free, vps=vps)
     if not free:
         return _enlarged(fit, response)
     test = _lever_arm_test(fit)
@@ -166,7 +171,10 @@ def fit_joint(
         none = fit.covariance[:, own] @ np.linalg.solve(fit.covariance[own, own], fit.state.values["lever_arm"])
         without = fit.state.moved(response @ none, -none, fit.layout)
         without = replace(without, values={**without.values, "lever_arm": np.zeros(3)})
-        fit = _enlarged(*_iterate(fit.model, without, fit.levels, dip=free_dip, lever_arm=False, vps=vps))
+        fit, response = _iterate(
+            fit.model, without, fit.levels, fit.iterations, dip=free_dip, lever_arm=False, vps=vps
+        )
+        fit = _enlarged(fit, response)
     return replace(fit, lever_arm_test=test)
 
 
@@ -199,10 +207,10 @@ def _jump_rates(fit: JointFit) -> Array:
 
 
 def _iterate(
-    model: Model, state: State, levels: Levels | None, *, dip: bool, lever_arm: bool, vps: VpsRecord | None
+    model: Model, state: State, levels: Levels | None, spent: int, *, dip: bool, lever_arm: bool, vps: VpsRecord | None
 ) -> tuple[JointFit, Array]:
     """Gauss–Newton with noise levels renewed at every step: the fit with the inverse information as covariance, and the
-    knots' response N_xx⁻¹N_xθ."""
+    knots' response N_xx⁻¹N_xθ. `spent` iterations came before."""
     layout, p = layout_of(model, state.values, dip=dip, lever_arm=lever_arm)
     knots, prior = model.knots, _Prior.at(model, state, layout, p)
     probe = Probe.draw(knots, model.readings.t, model.at, 3 * len(model.rows))
@@ -211,6 +219,11 @@ def _iterate(
     levels = levels or first_levels(model, state, path, residual)
     before: Array = np.zeros(p)
     for iteration in range(1, MAX_ITERATIONS + 1):
+        if iteration == ASTRAY:
+            state = joint_start.anew(model, state)
+            path = trajectory(model, state)
+            residual = residuals(model, state, path)
+            levels, before = first_levels(model, state, path, residual), np.zeros(p)
         weight = robust_weight(model, residual, levels)
         normal, joints, reaction = linearised(model, state, path, layout, p, weight, levels, probe, vps)
         prior.add(normal, state, layout)
@@ -241,12 +254,29 @@ def _iterate(
         settled = max(unsettled, float(np.max(np.abs(change) / claimed))) < SETTLED
         if settled or float(np.max(np.abs(change))) < ROUNDING:
             plain = inverse_information(information)
-            fit = JointFit(model, state, path, levels, weight, layout, plain, information, iteration, vps=vps)
+            fit = JointFit(model, state, path, levels, weight, layout, plain, information, spent + iteration, vps=vps)
             return fit, eliminated[:, :, :p]
-    raise EstimationError(
+    raise _no_minimum(model, iteration)
+
+
+def _no_minimum(model: Model, iterations: int) -> EstimationError:
+    """Why there is none: axes that show hardly anything but noise, if there are such, or else the readings."""
+    still = [
+        f"{name} {'xyz'[axis]}"
+        for name, triad in model.triads.items()
+        for axis in np.flatnonzero(white_noise_sigma(triad.x[triad.known]) > STILL)
+    ]
+    if still:
+        return EstimationError(
+            "axis_not_turned",
+            f"The joint estimate found no minimum: {', '.join(still)} read hardly more than noise. Add 60° either way"
+            " about every axis.",
+            {"iterations": iterations, "still": still},
+        )
+    return EstimationError(
         "joint_diverged",
         "The joint estimate found no minimum: the readings contradict each other or the start is too far off.",
-        {"iterations": iteration},
+        {"iterations": iterations},
     )
 
 

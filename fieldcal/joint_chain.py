@@ -11,6 +11,7 @@ record's length.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import expm, solve_continuous_lyapunov
@@ -24,6 +25,7 @@ ORDER = 3  # velocity, acceleration, jerk, scaled to m/s²
 STATES = 3 + 3 * ORDER  # attitude error first
 # Right-hand sides after the parameters: the gradient, and what the unknowns make of each group's probe.
 GRADIENT, SENSORS, JUMP, MOTION, BRIDGE = RIGHTS = range(5)
+RUN = 128  # knots eliminated at a time
 WEAK = 1e-2  # 1/rad²: keeps directions that nothing observes (heading without a magnetometer) from being singular
 
 
@@ -31,13 +33,15 @@ WEAK = 1e-2  # 1/rad²: keeps directions that nothing observes (heading without 
 class Knots:
     """Where the chain is tied: `index` (K,) sample of each knot; `of_sample` (n,) the knot at or before each sample;
     `share` (n,) of the interval gone by there; `joined` (K−1,) whether neighbours belong to one contiguous segment;
-    `interval_s` (K−1,) between them (1 where not joined); `motion` the translation's process per interval."""
+    `interval_s` (K−1,) between them (1 where not joined); `sample_s` between samples, median; `motion` the
+    translation's process per interval."""
 
     index: np.ndarray
     of_sample: np.ndarray
     share: Array
     joined: np.ndarray
     interval_s: Array
+    sample_s: float
     motion: Motion
 
 
@@ -67,7 +71,7 @@ def place_knots(t: Array, segment: np.ndarray, spacing_s: float) -> Knots:
     interval = np.where(joined, t[knot[1:]] - t[knot[:-1]], 1.0)
     of_sample = np.searchsorted(knot, np.arange(n), side="right") - 1
     share = (t - t[knot[of_sample]]) / np.r_[interval, 1.0][of_sample]
-    return Knots(knot, of_sample, share, joined, interval, _motion(interval))
+    return Knots(knot, of_sample, share, joined, interval, float(np.median(np.diff(t))), _motion(interval))
 
 
 def _motion(interval_s: Array) -> Motion:
@@ -124,30 +128,42 @@ def chain_solve(diagonal: Array, below: Array, right: Array) -> Array:
     """Solve the positive block tridiagonal system with blocks (K, m, m), (K−1, m, m) for right-hand sides (K, m, c).
 
     Block cyclic reduction: every other knot is eliminated at once, which leaves a chain of half the length; each level
-    is a handful of products of stacked blocks. Raises EstimationError `joint_singular`."""
+    is a handful of products of stacked blocks, in runs that a processor's cache holds. Raises EstimationError
+    `joint_singular`."""
+    if len(diagonal) == 1:
+        return np.asarray(_inverse(diagonal) @ right)
+    # An odd knot is below the even one before it, and the next even one below that.
+    odd, before, after = diagonal[1::2], below[0::2], below[1::2]
+    even, rest, between = np.empty_like(diagonal[0::2]), np.empty_like(right[0::2]), np.empty_like(after)
+    even[0], rest[0] = diagonal[0], right[0]  # a run begins with the even knot that the one before it ended with
+    back, forth, solved = np.empty_like(before), np.empty_like(after), np.empty_like(right)
+    own = solved[1::2]
+    ends = [*range(0, len(odd), RUN), len(odd)]
+    runs = [(slice(a, b), slice(a + 1, b + 1)) for a, b in pairwise(ends)]
+    for run, following in runs:
+        inverse, up, down = _inverse(odd[run]), before[run].transpose(0, 2, 1), after[run]
+        back[run], own[run] = inverse @ before[run], inverse @ right[1::2][run]
+        forth[run] = inverse[: len(down)] @ down.transpose(0, 2, 1)
+        between[run] = -down @ back[run][: len(down)]
+        even[following] = diagonal[0::2][following] - down @ forth[run]
+        rest[following] = right[0::2][following] - down @ own[run][: len(down)]
+        even[run] -= up @ back[run]
+        rest[run] -= up @ own[run]
+    solved[0::2] = chain_solve(even, between, rest)
+    for run, following in runs:
+        own[run] -= back[run] @ solved[0::2][run]
+        own[run][: len(forth[run])] -= forth[run] @ solved[0::2][following]
+    return solved
+
+
+def _inverse(blocks: Array) -> Array:
     try:
-        root = np.linalg.inv(np.linalg.cholesky(diagonal[1::2] if len(diagonal) > 1 else diagonal))
+        root = np.linalg.inv(np.linalg.cholesky(blocks))
     except np.linalg.LinAlgError as error:
         raise EstimationError(
             "joint_singular", "The joint equations are singular: the readings contradict the start."
         ) from error
-    inverse = root.transpose(0, 2, 1) @ root
-    if len(diagonal) == 1:
-        return np.asarray(inverse @ right)
-    odd, before, after = len(inverse), below[0::2], below[1::2]  # an odd knot below the even before it; the next below
-    forth = inverse[: len(after)] @ after.transpose(0, 2, 1)
-    back, own = inverse @ before, inverse @ right[1::2]
-    even, rest = diagonal[0::2].copy(), right[0::2].copy()
-    even[:odd] -= before.transpose(0, 2, 1) @ back
-    even[1:] -= after @ forth
-    rest[:odd] -= before.transpose(0, 2, 1) @ own
-    rest[1:] -= after @ own[: len(after)]
-    solved = np.empty_like(right)
-    solved[0::2] = chain_solve(even, -after @ back[: len(after)], rest)
-    own -= back @ solved[0::2][:odd]
-    own[: len(after)] -= forth @ solved[2::2]
-    solved[1::2] = own
-    return solved
+    return np.asarray(root.transpose(0, 2, 1) @ root)
 
 
 def solve_scaled(information: Array, gradient: Array) -> Array:

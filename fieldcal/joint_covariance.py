@@ -9,10 +9,7 @@ import numpy as np
 from fieldcal.joint_model import SENSED, Rows, sums_by_interval
 from fieldcal.joint_record import Model, State
 from fieldcal.rotation import Array
-from fieldcal.statistics import coloured_information
-
-# Blocks whose pulls on θ are taken for independent: longer than translation or a passing field remembers.
-BLOCK_S, FEWEST_BLOCKS = 2.0, 6
+from fieldcal.statistics import coloured_information, variance_by_blocks
 
 
 def covariance(
@@ -31,8 +28,7 @@ def covariance(
     varies from place to place, a temperature) is judged from means by interval: M = ΣΣ S̄ᵀ𝓡S̄ instead of ΣS̄ᵀS̄ for each
     sensor row, S̄ the sensitivity with the knots eliminated. And what is not the noise that the model thinks (strong for
     some seconds and weak for others, a translation that swings at one frequency) from the scores S̄ᵀr of blocks of
-    BLOCK_S, all residuals together: M = Σ(S̄ᵀr)(S̄ᵀr)ᵀ (cluster-robust; Liang and Zeger 1986). No standard deviation is
-    ever made smaller by either.
+    time, all residuals together (`variance_by_blocks`). No standard deviation is ever made smaller by either.
 
     Parameters
     ----------
@@ -88,20 +84,10 @@ def covariance(
         excess += coloured_information(seen, left) / variance - np.einsum("kcp,kcq->pq", seen, seen)
     plain = np.diagonal(inverse)
     coloured = plain + np.diagonal(inverse @ excess @ inverse)
-    by_blocks = _variance_by_blocks(score @ inverse, model.readings.t[model.knots.index])
+    elapsed = np.r_[0.0, np.cumsum(model.knots.interval_s * model.knots.joined)]
+    by_blocks = variance_by_blocks(score @ inverse, elapsed)
     enlarged = np.sqrt(np.maximum(1.0, np.maximum(coloured, by_blocks) / plain))
     return np.asarray(inverse * np.outer(enlarged, enlarged))
-
-
-def _variance_by_blocks(step: Array, t: Array) -> Array:
-    """Variance (p,) of Σ step (K, p) at times t (K,) from its sums over blocks; 0 where there are too few."""
-    block = np.unique(np.floor((t - t[0]) / BLOCK_S), return_inverse=True)[1]
-    blocks = int(block[-1]) + 1
-    if blocks < FEWEST_BLOCKS:
-        return np.zeros(step.shape[1])
-    total = np.zeros((blocks, step.shape[1]))
-    np.add.at(total, block, step)
-    return np.asarray(blocks * np.var(total, axis=0, ddof=1))
 
 
 def inverse_information(information: Array) -> Array:

@@ -21,7 +21,7 @@ from fieldcal.rotation import (
     to_rotation_vector,
 )
 
-CHUNK_ROWS = 8192
+CHUNK_ROWS = 512  # a few megabytes with all that is made of them: what a core holds in its cache
 RATE_SIDE_S = 0.03
 ACCELERATION = slice(3, 6)  # of a knot's translation
 SENSED = np.array([0, 1, 2, 6, 7, 8])  # of a knot's states: attitude and acceleration
@@ -84,11 +84,10 @@ def lever_arm_geometry(model: Model, state: State, own: slice) -> Array:
     scaled = state.values["gyroscope"]
     gyro = model.triads["gyroscope"]
     scale = scaled[:3] / gyro.spread
-    low_passed, change = model.readings.turning[:, model.at[own]]
+    low_passed, change = np.take(model.readings.turning, model.at[own], axis=1)
     rate = scale * (low_passed - gyro.centre) + scaled[3:]
-    geometry = skew(scale * change) + rate[:, :, None] * rate[:, None, :]
-    geometry[:, range(3), range(3)] -= np.sum(rate**2, axis=1)[:, None]
-    return np.asarray(geometry)
+    turn = skew(rate)
+    return np.asarray(skew(scale * change) + turn @ turn)
 
 
 def residuals(model: Model, state: State, path: Trajectory) -> Array:
@@ -117,7 +116,7 @@ def _sensed(
 def _slow_rate(model: Model, path: Trajectory, own: slice) -> Array:
     """Running mean of the rate over 2 RATE_SIDE_S at rows `own`, (m, 3): the gyroscope's noise would be the delay's."""
     at = model.at[own]
-    side = max(1, round(RATE_SIDE_S / float(np.median(np.diff(model.readings.t)))))
+    side = max(1, round(RATE_SIDE_S / model.knots.sample_s))
     first, last = max(int(at[0]) - side, 0), min(int(at[-1]) + side + 1, len(path.rate))
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(path.rate[first:last], axis=0)])
     low, high = np.maximum(at - side - first, 0), np.minimum(at + side + 1 - first, len(total) - 1)
@@ -128,13 +127,13 @@ def _sensed_at_once(model: Model, state: State, own: slice, turn: Array, name: s
     """The same of a triad without a delay of its own."""
     if name == "magnetometer":
         vector = model.field(float(state.values["dip"][0]))[0]
-        return turn @ vector, vector
+        return np.einsum("nij,j->ni", turn, vector), vector
     sign, g = np.sign(model.readings.gravity_mps2), abs(model.readings.gravity_mps2)
     vector = sign * (np.array([0.0, 0.0, g]) - translation(model, state, own))
     sensed = np.einsum("nij,nj->ni", turn, vector)
     arm = state.values["lever_arm"]
     if arm.any():
-        sensed = sensed - sign * (lever_arm_geometry(model, state, own) @ arm)
+        sensed = sensed - sign * np.einsum("nij,j->ni", lever_arm_geometry(model, state, own), arm)
     return sensed, vector
 
 
@@ -157,9 +156,11 @@ def chunks(model: Model) -> Iterator[tuple[slice, slice]]:
     starts = np.searchsorted(model.at, model.knots.index)  # first row of every interval
     first = 0
     while first < len(starts):
-        last = max(int(np.searchsorted(starts, starts[first] + CHUNK_ROWS)), first + 1)
-        end = len(model.at) if last >= len(starts) else int(starts[last])
-        yield slice(int(starts[first]), end), slice(first, min(last, len(starts)))
+        last = int(np.searchsorted(starts, starts[first] + CHUNK_ROWS))
+        if last == len(starts) or starts[last] == len(model.at):  # knots after the last row go with it
+            last = len(starts)
+        end = len(model.at) if last == len(starts) else int(starts[last])
+        yield slice(int(starts[first]), end), slice(first, last)
         first = last
 
 
@@ -258,31 +259,32 @@ def accumulate(
     p, (m, r) = len(normal.parameters), weight.shape
     root = np.sqrt(weight)
     share = model.knots.share[model.at[rows.own], None, None]
-    met = np.empty((m + 1, r, 12 + p + 4))
+    # Columns: pull at the knot before and after, parameters, residual, turns about the body's axes, both probes.
+    met = np.empty((m + 1, r, 6 + 6 + p + 1 + 3 + 2))
     met[m] = 0.0  # one row of nothing, to fill shorter intervals with
-    before, after, given = met[:m, :, :6], met[:m, :, 6:12], met[:m, :, 12:]
+    before, after, given, drawn = np.split(met[:m], [6, 12, 16 + p], axis=2)
     np.multiply(rows.by_knot, root[..., None], out=before)
     np.multiply(before, share, out=after)
-    np.subtract(before, after, out=before)
+    before -= after
     np.multiply(rows.by_parameter, root[..., None], out=given[..., :p])
     np.multiply(rows.residual, root, out=given[..., p])
     np.multiply(rows.by_rotation * root[..., None], probe.bridge[rows.own, None], out=given[..., p + 1 :])
-    by_interval = np.take(met, _padded(model, rows.own, ties), axis=0).reshape(ties.stop - ties.start, -1, 16 + p)
-    product = by_interval[..., :12].transpose(0, 2, 1) @ by_interval  # (knots, 12, 16 + p)
-    flat = given.reshape(-1, p + 4)
+    np.multiply(probe.sensors[rows.own], root > 0, out=drawn[..., 0])
+    np.sum(given[..., p + 1 :], axis=2, out=drawn[..., 1])
+    by_interval = np.take(met, _padded(model, rows.own, ties), axis=0)  # (knots, most rows, r, 18 + p)
+    by_row = by_interval.transpose(0, 2, 3, 1)
+    alone, together = (by_row[:, :, :12] @ by_row[:, :, 16 + p :].transpose(0, 1, 3, 2)).transpose(3, 0, 2, 1)
+    by_interval = by_interval.reshape(ties.stop - ties.start, -1, 18 + p)
+    product = by_interval[..., :12].transpose(0, 2, 1) @ by_interval[..., : 16 + p]  # (knots, 12, 16 + p)
+    flat = met[:m].reshape(m * r, -1)[:, 12 : 16 + p]
     total = flat.T @ flat
-    bridge = given[..., p + 1 :].sum(axis=2)
-    signs = probe.sensors[rows.own] * (root > 0)
+    own = (given[..., :p].transpose(1, 2, 0) @ drawn[..., :1].transpose(1, 0, 2))[..., 0].T
     normal.parameters += total[:p, :p]
     normal.parameters_right[:, GRADIENT] += total[:p, p]
-    own = (flat[:, :p].reshape(m, r, p) * signs[..., None]).sum(axis=0).T
     normal.parameters_right[:, SENSORS] += own.sum(axis=1)
     normal.parameters_right[:, BRIDGE] += total[:p, p + 1 :].sum(axis=1)
     groups[1][:p, :r] += own
-    groups[1][p, r:] += np.r_[total[p + 1 :, p + 1 :].sum(axis=1), np.sum(bridge**2, axis=0)]
-    reactions = ((met[:m, :, :12] * drawn[..., None]).reshape(m, -1) for drawn in (signs, bridge))
-    summed = (sums_by_interval(model, x, rows.own, ties).reshape(-1, r, 12) for x in reactions)
-    alone, together = (x.transpose(0, 2, 1) for x in summed)
+    groups[1][p, r:] += np.r_[total[p + 1 :, p + 1 :].sum(axis=1), np.sum(drawn[..., 1] ** 2, axis=0)]
     pulled = np.concatenate([alone, product[:, :, 13 + p :], together], axis=2)
     # Chain blocks: an interval's rows pull at the knot before it and, where the record goes on, at the one after.
     last = min(ties.stop, len(normal.diagonal) - 1)
@@ -314,10 +316,9 @@ def _padded(model: Model, own: slice, ties: slice) -> np.ndarray:
 def sums_by_interval(model: Model, x: Array, own: slice, ties: slice) -> Array:
     """Sums of the rows x (m, c) of a chunk over each of its intervals, (knots, c)."""
     starts = np.searchsorted(model.at[own], model.knots.index[ties])
-    sums = np.zeros((len(starts), *x.shape[1:]))
-    begun = starts < len(x)  # the others have no rows, and nothing for `reduceat` to stop the one before at
-    sums[begun] = np.add.reduceat(x, starts[begun], axis=0)
-    sums[np.diff(np.r_[starts, len(x)]) == 0] = 0.0
+    some = np.diff(np.r_[starts, len(x)]) > 0
+    sums = np.zeros((len(starts), x.shape[1]))
+    sums[some] = np.add.reduceat(x, starts[some], axis=0)
     return sums
 
 

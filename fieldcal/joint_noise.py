@@ -58,7 +58,7 @@ def first_levels(model: Model, state: State, path: Trajectory, residual: Array) 
 def gyro_walk(model: Model, state: State) -> float:
     """Walk of the integrated attitude, rad²/s, that the gyroscope's sample-to-sample noise makes."""
     noise = np.max(white_noise_sigma(model.triads["gyroscope"].x) * np.abs(state.values["gyroscope"][:3]))
-    return float(noise**2 * np.median(np.diff(model.readings.t)))
+    return float(noise**2 * model.knots.sample_s)
 
 
 def renewed_levels(

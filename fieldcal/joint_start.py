@@ -106,6 +106,18 @@ def prepare(
     return model, State(q[knots.index], np.zeros((len(knots.index), STATES - 3)), values)
 
 
+def anew(model: Model, state: State) -> State:
+    """The state with attitudes from the constants that it has, as if they had been the start's, and no translation: a
+    start whose constants were far off leaves some attitudes where a passing field or translation explains them."""
+    constants = {}
+    for name in model.triads:
+        own = model.triads[name].to_logged() @ state.values[name]
+        constants[name] = own[:3], own[3:]
+    vectors = {name: constants.get(name) for name in ("accelerometer", "magnetometer")}
+    q, _ = _start_attitude(model.readings, vectors, constants["gyroscope"])
+    return State(q[model.knots.index], np.zeros_like(state.motion), state.values)
+
+
 def _dip(field_ned: Array) -> float:
     return float(np.arctan2(field_ned[2], np.hypot(field_ned[0], field_ned[1])))
 

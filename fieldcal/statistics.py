@@ -11,6 +11,9 @@ from fieldcal.rotation import Array
 
 MAD_TO_SIGMA = 1.4826
 HUBER = 1.345
+# Blocks taken for independent: at least so long, which is longer than a hand's motion remembers, and so few that their
+# spread can still be told.
+BLOCK_S, BLOCKS, FEWEST_BLOCKS = 2.0, 20, 6
 
 
 def robust_sigma(residual: ArrayLike) -> float:
@@ -113,3 +116,31 @@ def least_squares_covariance(sensitivity: ArrayLike, residual: ArrayLike, *, nui
     middle, independent = _coloured(s, r)
     freedom = min(independent / max(independent - (p + nuisance) / channels, 1e-9), 4.0)
     return sigma_squared * inverse, inverse @ (freedom * middle) @ inverse
+
+
+def variance_by_blocks(pull: ArrayLike, t: ArrayLike) -> Array:
+    """Variance of a sum whose terms are uncorrelated over long times only: BLOCKS sums of neighbours take its place
+    (cluster-robust; Liang and Zeger, 1986).
+
+    Parameters
+    ----------
+    pull : (n, p) array
+        Terms of each of p sums: what every residual does to every parameter. A sum is 0 at a fit's minimum, so their
+        mean counts for nothing.
+    t : (n,) array
+        Their times, s, ascending, gaps taken out; blocks are no shorter than BLOCK_S.
+
+    Returns
+    -------
+    (p,) array
+        Variances; 0 where there are fewer than FEWEST_BLOCKS blocks to judge by.
+    """
+    pull, t = np.asarray(pull, dtype=float), np.asarray(t, dtype=float)
+    length = max(BLOCK_S, float(t[-1] - t[0]) / BLOCKS)
+    block = np.unique(np.floor((t - t[0]) / length), return_inverse=True)[1]
+    blocks = int(block[-1]) + 1
+    if blocks < FEWEST_BLOCKS:
+        return np.zeros(pull.shape[1])
+    total = np.zeros((blocks, pull.shape[1]))
+    np.add.at(total, block, pull)
+    return np.asarray(blocks * np.var(total, axis=0, ddof=1))

@@ -106,3 +106,27 @@ def test_claimed_sd_under_huber_weights_is_honest() -> None:
 
 def test_no_inflation_without_clipping() -> None:
     assert statistics.huber_inflation(np.ones(10)) == 1.0
+
+
+@pytest.mark.parametrize("duration_s", [40.0, 300.0])
+def test_variance_by_blocks_is_that_over_many_records(duration_s: float) -> None:
+    """Terms that remember for half a second, strong in one third of the record: the variance of their sum, mean taken
+    out, over 400 records; independent terms would claim a tenth of it."""
+    rng = np.random.default_rng(3)
+    t = np.arange(0.0, duration_s, 0.1)
+    loud = np.where(t < duration_s / 3, 3.0, 0.3)[:, None]
+    slope = np.linspace(-1.0, 1.0, len(t))[:, None]
+    pulls = [autoregressive(rng, (len(t), 1), 0.8) * loud * slope for _ in range(400)]
+    claimed = np.mean([statistics.variance_by_blocks(pull, t) for pull in pulls])
+    assert claimed == pytest.approx(np.var([pull.sum() for pull in pulls]), rel=0.2)
+    assert claimed > 5.0 * np.mean([np.sum(pull**2) for pull in pulls])
+
+
+def test_variance_by_blocks_needs_some_and_follows_units() -> None:
+    rng = np.random.default_rng(4)
+    t = np.arange(0.0, 40.0, 0.1)
+    pull = rng.normal(size=(len(t), 2))
+    assert not statistics.variance_by_blocks(pull[:100], t[:100]).any()
+    shifted = statistics.variance_by_blocks(pull + 5.0, t)
+    np.testing.assert_allclose(shifted, statistics.variance_by_blocks(pull, t), rtol=1e-9)
+    np.testing.assert_allclose(statistics.variance_by_blocks(-3.0 * pull, t + 7.0), 9.0 * shifted, rtol=1e-9)
