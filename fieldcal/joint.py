@@ -42,7 +42,7 @@ from fieldcal.joint_noise import (
     unsettled_by,
 )
 from fieldcal.joint_record import CROSS, TRIADS, Model, State, off_diagonal
-from fieldcal.joint_scores import integrated_translation, logged_units, within_intervals
+from fieldcal.joint_scores import logged_units, within_intervals
 from fieldcal.joint_vps import VpsRecord
 from fieldcal.rotation import Array, body_from_inertial
 from fieldcal.statistics import white_noise_sigma
@@ -50,6 +50,9 @@ from fieldcal.statistics import white_noise_sigma
 LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
 BURST_ROUNDS = 3  # how often the fit looks for passing fields in what it left of the magnetometer
 MAX_ITERATIONS = 50
+# A step that takes back this part of the one before, and more, is cut to it: the slope lacks that of the gradient's
+# corrections, so that steps may be too long.
+TOO_FAR = 0.5
 ASTRAY = 20  # iterations after which a fit that has not settled starts anew from the constants reached
 # Settled: every step below this part of what one could claim as standard deviation, every noise level below it too.
 SETTLED = 0.1
@@ -143,8 +146,8 @@ def fit_joint(
     Notes
     -----
     The likelihood is maximised over the attitudes, with every residual in logged units: that is consistent (a rate or
-    a length in SI units would shrink with its scale). Over the translation, which has a prior of its own, it is
-    integrated; what that adds to the accelerometer's gradient is `integrated_translation`.
+    a length in SI units would shrink with its scale). Translation is noise to the accelerometer's scale, which is found
+    from gravity and lever arm alone: then no spectrum or direction of translation draws it off, whatever its prior.
 
     It cannot see what moves all triads together with the body: a common rotation of the axes, or a field that turns
     with the vehicle other than hard iron.
@@ -214,12 +217,13 @@ def _iterate(
     path = trajectory(model, state)
     residual = residuals(model, state, path)
     levels = levels or first_levels(model, state, path, residual)
+    before: Array = np.zeros(p)
     for iteration in range(1, MAX_ITERATIONS + 1):
         if iteration == ASTRAY:
             state = joint_start.anew(model, state)
             path = trajectory(model, state)
             residual = residuals(model, state, path)
-            levels = first_levels(model, state, path, residual)
+            levels, before = first_levels(model, state, path, residual), np.zeros(p)
         weight = robust_weight(model, residual, levels)
         normal, joints, reaction = linearised(model, state, path, layout, p, weight, levels, probe, vps)
         prior.add(normal, state, layout)
@@ -228,13 +232,13 @@ def _iterate(
         gradient[own, GRADIENT] += logged_units(model, state, path, levels.walk)
         within = levels.walk * within_intervals(model, state, layout, reaction, eliminated[:, :, p + BRIDGE])
         gradient[:, GRADIENT] += within
-        if "accelerometer" in layout:
-            own = layout["accelerometer"].start + np.arange(3)
-            gradient[own, GRADIENT] += integrated_translation(model, state, reaction, eliminated[:, :, p + SENSORS])
         theta = solve_scaled(information, gradient)
         response = eliminated[:, :, p:] - eliminated[:, :, :p] @ theta
         step, change = response[:, :, GRADIENT], theta[:, GRADIENT]
         least = _least_part(state, step, change, layout)
+        if change @ information @ before < -TOO_FAR * (before @ information @ before):
+            least *= TOO_FAR
+        before = least * change
         state = state.moved(least * step, least * change, layout)
         path = trajectory(model, state)
         residual = residuals(model, state, path)

@@ -292,9 +292,9 @@ class Probe:
     bridge: Array  # (n, 3), √s
 
     @classmethod
-    def draw(cls, knots: Knots, t: Array, at: np.ndarray, rows: int) -> Probe:
+    def draw(cls, knots: Knots, t: Array, at: np.ndarray, rows: int, *, seed: int = 0) -> Probe:
         """For `rows` residuals at each of the samples `at` (m,) of `t` (n,)."""
-        rng = np.random.default_rng(0)
+        rng = np.random.default_rng(seed)
         k = len(knots.index)
         shapes = ((len(at), rows), (k - 1, 3), (k - 1, ORDER, 3), (k, ORDER, 3), (len(t), 3))
         sensors, jump, motion, start, noise = (rng.integers(0, 2, shape) * 2.0 - 1.0 for shape in shapes)

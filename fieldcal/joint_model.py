@@ -129,16 +129,20 @@ def _sensed_at_once(model: Model, state: State, own: slice, turn: Array, name: s
         vector = model.field(float(state.values["dip"][0]))[0]
         return np.einsum("nij,j->ni", turn, vector), vector
     sign, g = np.sign(model.readings.gravity_mps2), abs(model.readings.gravity_mps2)
-    knots = model.knots
-    k, share = knots.of_sample[model.at[own]], knots.share[model.at[own], None]
-    a = state.motion[:, ACCELERATION]
-    after = np.minimum(k + 1, len(a) - 1)
-    vector = sign * (np.array([0.0, 0.0, g]) - (1.0 - share) * a[k] - share * a[after])
+    vector = sign * (np.array([0.0, 0.0, g]) - translation(model, state, own))
     sensed = np.einsum("nij,nj->ni", turn, vector)
     arm = state.values["lever_arm"]
     if arm.any():
         sensed = sensed - sign * np.einsum("nij,j->ni", lever_arm_geometry(model, state, own), arm)
     return sensed, vector
+
+
+def translation(model: Model, state: State, own: slice = slice(None)) -> Array:
+    """Acceleration of the centre of mass at rows `own`, inertial, m/s² (m, 3)."""
+    at = model.at[own]
+    k, share = model.knots.of_sample[at], model.knots.share[at, None]
+    a = state.motion[:, ACCELERATION]
+    return np.asarray((1.0 - share) * a[k] + share * a[np.minimum(k + 1, len(a) - 1)])
 
 
 def _residual(model: Model, state: State, own: slice, name: str, sensed: Array) -> Array:
@@ -179,8 +183,14 @@ def sensitivities(
             by_knot[:, row, :3] = gain * (turn @ skew(vector))
             by_parameter[:, row, by_gyroscope] = by_knot[:, row, :3] @ moved
             column = layout[name].start
+            # Translation, in the residuals too, would draw λ off: gravity and lever arm alone tell it.
+            steady = sensed
+            if name == "accelerometer":
+                steady = sensed + np.sign(model.readings.gravity_mps2) * np.einsum(
+                    "nij,nj->ni", turn, translation(model, state, own)
+                )
             for axis in range(3):
-                scaled = (sensed[:, axis] - constants[3 + axis]) / constants[axis]
+                scaled = (steady[:, axis] - constants[3 + axis]) / constants[axis]
                 by_parameter[:, 3 * i + axis, column + axis] = -known * scaled / constants[axis]
                 by_parameter[:, 3 * i + axis, column + 3 + axis] = -known / constants[axis]
             if f"{name}_cross" in layout:

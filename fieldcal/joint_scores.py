@@ -1,5 +1,9 @@
 """What the joint estimator's scores lack beside the quadratic form, as residuals are in logged units and noise is in
-the sensitivities too: corrections of the gradient on the triads' scales."""
+the sensitivities too: corrections of the gradient on the triads' scales.
+
+Without them the gyroscope's scales are drawn off by some standard deviations on a 40 s flight at the paper's noise;
+with them by 0.1 at most, which is what the attitude's own error does in second order: it shortens the predicted vectors
+by its variance."""
 
 from __future__ import annotations
 
@@ -39,14 +43,3 @@ def within_intervals(
         own = layout[name].start + np.arange(3)
         out[own] = (1.0 if i == 0 else -1.0) * left[3 * i : 3 * i + 3] / state.values[name][:3]
     return out
-
-
-def integrated_translation(model: Model, state: State, reaction: tuple[Array, Array], response: Array) -> Array:
-    """Gradient (3,) on the accelerometer's λ' from integrating over the translation instead of maximising over it.
-
-    With V(λ) the logged readings' covariance, translation included, and H the attitudes' sensitivity, the score of a
-    likelihood maximised over the attitudes has the bias −½ tr[(HᵀV⁻¹H)⁻¹ HᵀV⁻¹ V_λ V⁻¹H]. Taken off, what is left
-    beside the quadratic form is tr_i/λ_i: the trace of row i's hat matrix that belongs to the translation."""
-    row = 3 * model.rows.index("accelerometer")
-    taken = np.einsum("kcr,kc->r", reaction[0][:, 3:, row : row + 3], response[:, SENSED[3:]])
-    return np.asarray(taken / state.values["accelerometer"][:3])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.signal import welch
 
 from fieldcal import attitude as wahba
 from fieldcal.ellipsoid import fit_ellipsoid
@@ -14,7 +15,7 @@ from fieldcal.gyro_output import propagate_stretches
 from fieldcal.joint_chain import STATES, place_knots
 from fieldcal.joint_record import Model, Readings, State, averaging_side, stretches
 from fieldcal.rotation import Array, angle_between, body_from_inertial, continuous, from_rotation_vector, multiply
-from fieldcal.smoothing import differentiate_samples, smooth_samples
+from fieldcal.smoothing import differentiate_samples, fill, lattice, smooth_samples
 
 SPACING_S = 0.08
 START_CUTOFF_HZ = 4.0
@@ -22,8 +23,10 @@ START_CUTOFF_HZ = 4.0
 # translation and passing magnets is left, and the more of what the gyroscope drifts.
 WINDOWS = ((0.2, 1.5), (0.07, 4.5), (0.02, 15.0))
 TRUST = 0.1  # relative; a field that far off its own mean has half the weight
-# Rates for the lever arm: their derivative's noise would shrink it (a regressor), so no more than the motion needs.
-LEVER_ARM_CUTOFF_HZ, LEVER_ARM_SIDE_S = 1.5, 1.0
+# Rates for the lever arm: their derivative's noise would shrink it (a regressor), so they end, within 0.8 Hz
+# (π/TURNING_SIDE_S), where turning no longer has OVER_NOISE times the density of noise, which is that of NOISE_HZ.
+OVER_NOISE, TURNING_SIDE_S, SPECTRUM_S = 10.0, 4.0, 8.0
+NOISE_HZ, TURNING_HZ = (5.0, 20.0), (0.5, 5.0)
 
 Constants = tuple[Array, Array]
 
@@ -38,11 +41,25 @@ def low_passed(t: Array, segment: np.ndarray, x: Array, cutoff_hz: float, side_s
 
 def turning(t: Array, segment: np.ndarray, gyroscope: Array) -> Array:
     """Low-passed gyroscope and its derivative (2, n, 3), logged units: `Readings.turning`."""
-    low = low_passed(t, segment, gyroscope, LEVER_ARM_CUTOFF_HZ, LEVER_ARM_SIDE_S)
+    low = low_passed(t, segment, gyroscope, _fastest_turning_hz(t, segment, gyroscope), TURNING_SIDE_S)
     change = np.empty_like(low)
     for a, b in stretches(segment):
-        change[a:b] = differentiate_samples(t[a:b], low[a:b], window_s=0.05)
+        change[a:b] = differentiate_samples(t[a:b], low[a:b])
     return np.stack([low, change])
+
+
+def _fastest_turning_hz(t: Array, segment: np.ndarray, gyroscope: Array) -> float:
+    """Up to which frequency the longest stretch's spectrum stands out of the gyroscope's noise, axes taken together."""
+    a, b = max(stretches(segment), key=lambda own: own[1] - own[0])
+    index, interval_s = lattice(t[a:b])
+    x = fill(index, gyroscope[a:b])
+    frequency, density = welch(x, 1.0 / interval_s, nperseg=min(len(x), round(SPECTRUM_S / interval_s)), axis=0)
+    from_hz = min(NOISE_HZ[0], 0.5 * frequency[-1])
+    noise = np.median(density[(frequency >= from_hz) & (frequency <= max(NOISE_HZ[1], from_hz))], axis=0)
+    over = np.mean(density / np.maximum(noise, 1e-300), axis=1)
+    strongest = int(np.argmax(over * (frequency <= TURNING_HZ[1])))
+    lost = strongest + np.flatnonzero(over[strongest:] < OVER_NOISE)
+    return float(np.clip(frequency[max(lost[0] - 1, 0)] if len(lost) else np.inf, *TURNING_HZ))
 
 
 def start_of_triad(logged: Array, magnitude: float, polarity: Array) -> Constants | None:
