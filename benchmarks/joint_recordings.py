@@ -1,4 +1,5 @@
-"""Open-loop attitude drift on real recordings with optical poses: gyroscope as logged, after serial, after joint.
+"""Open-loop attitude drift on real recordings with optical poses: gyroscope as logged, after serial, after joint, and
+with the reference constants.
 
     python benchmarks/joint_recordings.py ARCHIVE LOG [LOG …] [--use-vps]
 
@@ -36,8 +37,8 @@ def main() -> None:
     given = parser.parse_args()
     configuration = load(given.archive / "fieldcal.toml")
     reference = json.loads((given.archive / "expected.json").read_text())
-    print("| log | raw | serial | joint | joint gyroscope against reference, sd (scale x y z, bias x y z) |")
-    print("|---|---|---|---|---|")
+    print("| log | raw | serial | joint | reference | joint gyroscope − reference, sd (scale x y z, bias x y z) |")
+    print("|---|---|---|---|---|---|")
     for name in given.log:
         path = given.archive / name
         vehicle = configuration.vehicle(path.parent.parent.name)
@@ -45,6 +46,7 @@ def main() -> None:
         settings = ingest.settings_of(facts, vehicle) | {"method": "joint", "use_vps": given.use_vps}
         results = run_flight(signals, settings)
         drift = [_raw_drift(results, settings), *(_drift(results, m) for m in ("output_error", "joint"))]
+        drift.append(_reference_drift(results, settings, _entry(reference, name)))
         cells = ["–" if value is None else f"{value:.2f}°" for value in drift]
         print(f"| {name} | " + " | ".join(cells) + f" | {_against(results, settings, reference, name)} |", flush=True)
 
@@ -59,16 +61,35 @@ def _drift(results: dict[str, StageResult], method: str) -> float | None:
 
 def _raw_drift(results: dict[str, StageResult], settings: dict[str, Any]) -> float | None:
     """The logged unit alone; None for counts."""
-    nominal, vps = settings["nominal_scale"]["gyroscope"], results["vps_sync"].tables.get("vps_aligned")
-    if nominal is None or vps is None:
+    nominal = settings["nominal_scale"]["gyroscope"]
+    if nominal is None:
+        return None
+    sign = np.asarray(settings["polarity"]["gyroscope"], dtype=float)
+    return _integrated_drift(results, settings, np.asarray(nominal) * sign, np.zeros(3))
+
+
+def _reference_drift(
+    results: dict[str, StageResult], settings: dict[str, Any], entry: dict[str, Any] | None
+) -> float | None:
+    if entry is None or settings["units"]["gyroscope"] == "counts":
+        return None
+    return _integrated_drift(results, settings, np.asarray(entry["scale"]), np.asarray(entry["bias_rad_s"]))
+
+
+def _integrated_drift(
+    results: dict[str, StageResult], settings: dict[str, Any], scale: np.ndarray, bias: np.ndarray
+) -> float | None:
+    """Rms angle, degrees, between the optical attitude and the gyroscope integrated with these constants, each segment
+    from its best start."""
+    vps = results["vps_sync"].tables.get("vps_aligned")
+    if vps is None:
         return None
     samples = results["smoothing"].tables["samples"]
     origin = int(samples["t_ns"][0])
     t, at, segment = seconds(samples["t_ns"], origin), seconds(vps["t_ns"], origin), samples["segment"].to_numpy()
-    sign = np.asarray(settings["polarity"]["gyroscope"], dtype=float)
-    rate = matrix(samples, triad("gyroscope")) * np.asarray(nominal) * sign
     near = bridged(t, at)
     part = segment[np.clip(np.searchsorted(t, at), 0, len(t) - 1)][near]
+    rate = matrix(samples, triad("gyroscope")) * scale + bias
     own = slerp(t, propagate_stretches(t, rate, segment), at)[near]
     optical = sensor_attitude(matrix(vps, QUATERNION), settings)[near]
     model = start_stretches(own, optical, part, np.ones(len(own)), fixed=False)
