@@ -50,8 +50,8 @@ from fieldcal.statistics import white_noise_sigma
 LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
 BURST_ROUNDS = 3  # how often the fit looks for passing fields in what it left of the magnetometer
 MAX_ITERATIONS = 50
-# A step that takes back this part of the one before, and more, is cut to it: the slope lacks that of the gradient's
-# corrections, so that steps may be too long.
+# A step that takes back more than this part of the one before is taken to this part only: the slope lacks that of the
+# gradient's corrections, so that steps may be too long.
 TOO_FAR = 0.5
 ASTRAY = 20  # iterations after which a fit that has not settled starts anew from the constants reached
 # Settled: every step below this part of what one could claim as standard deviation, every noise level below it too.
