@@ -37,11 +37,12 @@ def bias_walk(rate: ArrayLike, interval_s: ArrayLike, joined: ArrayLike) -> floa
         q, rad/s/√s; 0 where white noise alone is as likely, or every segment is too short to tell.
     """
     rate, joined = np.asarray(rate, dtype=float), np.asarray(joined, dtype=bool)
-    step = float(np.mean(np.asarray(interval_s, dtype=float)[joined])) if joined.any() else 0.0
+    if not joined.any():
+        return 0.0
+    step = float(np.mean(np.asarray(interval_s, dtype=float)[joined]))
     edge = np.flatnonzero(np.diff(np.r_[False, joined, False]))
     parts = [_spectrum(rate[a:b], step) for a, b in zip(edge[0::2], edge[1::2], strict=True)]
-    power = np.concatenate([p for p, _ in parts]) if parts else np.zeros(0)
-    gain = np.concatenate([g for _, g in parts]) if parts else np.zeros(0)
+    power, gain = (np.concatenate(own) for own in zip(*parts, strict=True))
     if len(power) < 2 or not power.any():
         return 0.0
     shape = 1.0 + RATIOS[:, None] * gain

@@ -31,7 +31,17 @@ from fieldcal.joint_chain import (
     whitened_motion,
 )
 from fieldcal.joint_covariance import covariance, inverse_information
-from fieldcal.joint_model import SENSED, Rows, Trajectory, accumulate, layout_of, residuals, sensitivities, trajectory
+from fieldcal.joint_model import (
+    SENSED,
+    Rows,
+    Trajectory,
+    accumulate,
+    body_jumps,
+    layout_of,
+    residuals,
+    sensitivities,
+    trajectory,
+)
 from fieldcal.joint_noise import (
     Levels,
     first_levels,
@@ -44,7 +54,7 @@ from fieldcal.joint_noise import (
 from fieldcal.joint_record import CROSS, TRIADS, Model, State, off_diagonal
 from fieldcal.joint_scores import logged_units, within_intervals
 from fieldcal.joint_vps import VpsRecord
-from fieldcal.rotation import Array, body_from_inertial
+from fieldcal.rotation import Array
 from fieldcal.statistics import white_noise_sigma
 
 LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
@@ -89,9 +99,9 @@ class JointFit:
 
     def constants(self, name: str) -> tuple[Array, Array, Array]:
         """(λ (3,), b (3,), covariance (6, 6)) of a triad without cross-axis terms, logged units."""
-        transform = self.model.triads[name].to_logged()
-        value, own = transform @ self.state.values[name], self.layout[name]
-        return value[:3], value[3:], transform @ self.covariance[own, own] @ transform.T
+        triad, own = self.model.triads[name], self.layout[name]
+        transform = triad.to_logged()
+        return *triad.logged(self.state.values[name]), transform @ self.covariance[own, own] @ transform.T
 
     def full_constants(self, name: str) -> tuple[Array, Array, Array]:
         """(Λ (3, 3), b (3,), covariance (12, 12) of Λ by rows and b) of a triad with cross-axis terms, logged units."""
@@ -194,16 +204,11 @@ def _enlarged(fit: JointFit, response: Array) -> JointFit:
     process = whitened_motion(knots, strength, response[:, 3:]), whitened_motion(knots, strength, fit.state.motion)
     own = covariance(fit.model, chunks, response, fit.information, whitening, jumps, process, poses)
     # The bias is the record's mean; its own walk takes it away from that to either end.
-    walk = bias_walk(_jump_rates(fit), knots.interval_s, knots.joined)
+    rate = body_jumps(fit.state, fit.path) / knots.interval_s[:, None]
+    walk = bias_walk(rate, knots.interval_s, knots.joined)
     bias = np.arange(3, 6) + fit.layout["gyroscope"].start
     own[bias, bias] += walk**2 * (fit.model.readings.t[-1] - fit.model.readings.t[0]) / 3.0
     return replace(fit, covariance=own, bias_walk=walk)
-
-
-def _jump_rates(fit: JointFit) -> Array:
-    """Rate (K−1, 3), rad/s, sensor axes, that the attitude has beyond the gyroscope's over each interval."""
-    jump = np.einsum("kij,kj->ki", body_from_inertial(fit.state.q[:-1]), fit.path.jump)
-    return jump / fit.model.knots.interval_s[:, None]
 
 
 def _iterate(

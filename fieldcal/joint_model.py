@@ -50,6 +50,11 @@ def trajectory(model: Model, state: State) -> Trajectory:
     return Trajectory(multiply(from_rotation_vector(spread), multiply(state.q[knots.of_sample], since)), rate, jump)
 
 
+def body_jumps(state: State, path: Trajectory) -> Array:
+    """The jumps (K−1, 3), rad, about the sensor axes at each interval's start: the gyroscope's error over it."""
+    return np.einsum("kij,kj->ki", body_from_inertial(state.q[:-1]), path.jump)
+
+
 def _since_knots(knots: Knots, steps: Array) -> tuple[Array, Array]:
     """Rotation (n, 4) since the knot before each sample and over each interval (K−1, 4) from steps (n−1, 4) between
     samples: a scan in step over all intervals."""

@@ -108,6 +108,11 @@ class Centred:
         """(λ', b') (6,) of constants in logged units."""
         return np.concatenate([scale * self.spread, bias + scale * self.centre])
 
+    def logged(self, scaled: Array) -> tuple[Array, Array]:
+        """(λ, b) in logged units of (λ', b') (6,)."""
+        value = self.to_logged() @ scaled
+        return value[:3], value[3:]
+
     def to_logged(self) -> Array:
         """(λ, b) = T (λ', b'), (6, 6)."""
         return from_centred(self.centre, self.spread)

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fieldcal.joint_model import SENSED, Trajectory
+from fieldcal.joint_model import SENSED, Trajectory, body_jumps
 from fieldcal.joint_record import Model, State
-from fieldcal.rotation import Array, body_from_inertial
+from fieldcal.rotation import Array
 
 
 def logged_units(model: Model, state: State, path: Trajectory, walk: float) -> Array:
@@ -22,8 +22,7 @@ def logged_units(model: Model, state: State, path: Trajectory, walk: float) -> A
     A jump c of the attitude is gyroscope noise of c/λ logged units; as an angle it would shrink with λ, and with it the
     rates (the attenuation of a noisy regressor). ∂/∂λ_i of −½Σ(c_i/λ_i)²/σ² is Σc_i²/(λ_i walk Δt)."""
     knots = model.knots
-    jump = np.einsum("kij,kj->ki", body_from_inertial(state.q[:-1]), path.jump)
-    square = np.sum(jump**2 / (walk * knots.interval_s)[:, None], axis=0)
+    square = np.sum(body_jumps(state, path) ** 2 / (walk * knots.interval_s)[:, None], axis=0)
     # Noise makes one each; more is misfit that the walk's bound keeps from being noise, and no reason to move.
     return np.asarray(np.minimum(square, knots.joined.sum()) / state.values["gyroscope"][:3])
 

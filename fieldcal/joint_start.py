@@ -109,10 +109,7 @@ def prepare(
 def anew(model: Model, state: State) -> State:
     """The state with attitudes from the constants that it has, as if they had been the start's, and no translation: a
     start whose constants were far off leaves some attitudes where a passing field or translation explains them."""
-    constants = {}
-    for name in model.triads:
-        own = model.triads[name].to_logged() @ state.values[name]
-        constants[name] = own[:3], own[3:]
+    constants = {name: triad.logged(state.values[name]) for name, triad in model.triads.items()}
     vectors = {name: constants.get(name) for name in ("accelerometer", "magnetometer")}
     q, _ = _start_attitude(model.readings, vectors, constants["gyroscope"])
     return State(q[model.knots.index], np.zeros_like(state.motion), state.values)

@@ -23,9 +23,10 @@ from fieldcal.frames import (
 )
 from fieldcal.joint import JointFit, fit_joint
 from fieldcal.joint_covariance import advice
+from fieldcal.joint_model import body_jumps
 from fieldcal.joint_record import TERMS, Readings
 from fieldcal.results import StageResult, fatal_fault, triad_rows, zero_slope_rows
-from fieldcal.rotation import Array, body_from_inertial, from_matrix, multiply
+from fieldcal.rotation import Array, from_matrix, multiply
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Settings, Tables, is_sound, mean_temperature, reference_reading, refusal
 from fieldcal.stages.joint_reference import Poses, poses_of, with_poses
@@ -275,8 +276,8 @@ def gyro_noise_share(fit: JointFit) -> float:
 def axis_noise_share(fit: JointFit) -> Array:
     """The same of each gyroscope axis (3,). Of an axis about which the vehicle hardly turned noise is all there is, and
     a regressor that is noise says nothing of its scale, however small its sd."""
-    knots, q = fit.model.knots, fit.state.q[:-1]
-    jump = np.einsum("kij,kj->ki", body_from_inertial(q), fit.path.jump)[knots.joined]
+    knots = fit.model.knots
+    jump = body_jumps(fit.state, fit.path)[knots.joined]
     samples = np.diff(knots.index)
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(fit.path.rate, axis=0)])
     mean = (total[knots.index[1:]] - total[knots.index[:-1]]) / samples[:, None]
