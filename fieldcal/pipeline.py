@@ -14,6 +14,7 @@ import polars as pl
 
 from fieldcal.results import StageResult, fatal_fault
 from fieldcal.stages import attitude, comparison, gyroscope, joint, preparation, sanity, vector_triads, vps, warm_up
+from schemas import SchemaMismatch, conform
 
 Run = Callable[[Mapping[str, pl.DataFrame], Mapping[str, Any]], StageResult]
 
@@ -228,7 +229,7 @@ PIPELINE: tuple[Stage, ...] = (
             "motor_faults": "vectors.faults",
         },
         (),
-        ("calibration", "covariance", "attitude", "held_out"),
+        ("calibration", "covariance", "trajectory", "held_out"),
         (
             *AXES,
             "method",
@@ -258,7 +259,7 @@ PIPELINE: tuple[Stage, ...] = (
             "attitude": "attitude_pass2.attitude",
             "gyroscope": "gyro_output.calibration",
             "joint": "joint.calibration",
-            "joint_attitude": "joint.attitude",
+            "trajectory": "joint.trajectory",
             "motor_faults": "vectors.faults",
             **FAULTS,
         },
@@ -278,8 +279,8 @@ PIPELINE: tuple[Stage, ...] = (
             "gyroscope": "gyro_output.calibration",
             "vps_aligned": "vps_sync.vps_aligned",
             "joint": "joint.calibration",
-            "joint_attitude": "joint.attitude",
-            "joint_held_out": "joint.held_out",
+            "trajectory": "joint.trajectory",
+            "held_out": "joint.held_out",
         },
         ("samples",),
         ("fit",),
@@ -321,7 +322,17 @@ def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: Mappin
                 reason_code=f"no_{need}",
                 reason=f"{stage.name} needs {stage.reads[need]}, which {source} could not give.",
             )
-    return stage.function(inputs, {name: settings[name] for name in stage.settings})
+    result = stage.function(inputs, {name: settings[name] for name in stage.settings})
+    _check_written(stage, result)
+    return result
+
+
+def _check_written(stage: Stage, result: StageResult) -> None:
+    """Raise `SchemaMismatch` unless what a stage wrote is what it declares, by the tables' schemas."""
+    if undeclared := sorted(set(result.tables) - set(stage.writes)):
+        raise SchemaMismatch(f"stage {stage.name} wrote {', '.join(undeclared)}, which it does not declare")
+    for name, frame in result.tables.items():
+        conform(frame.to_arrow(), name, stage=True)
 
 
 def run_flight(signals: Mapping[str, pl.DataFrame], settings: Mapping[str, Any]) -> dict[str, StageResult]:

@@ -4,7 +4,7 @@
 with it, `python -m schemas` prints the data dictionary.
 """
 
-from schemas.arrow import SchemaMismatch, arrow_schema, check
+from schemas.arrow import SchemaMismatch, arrow_schema, check, conform
 from schemas.column import AS_LOGGED, Column, Table
 from schemas.tables import (
     HISTORY_TABLES,
@@ -27,6 +27,7 @@ __all__ = [
     "Table",
     "arrow_schema",
     "check",
+    "conform",
     "stage_columns",
     "table_columns",
     "table_key",

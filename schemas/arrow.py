@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import pyarrow as pa
 
 from schemas.column import AS_LOGGED
-from schemas.tables import TABLES, table_columns
+from schemas.tables import TABLES, table_columns, table_key
 
 TABLE_KEY = "fieldcal.table"
 VERSION_KEY = "fieldcal.schema_version"
@@ -76,3 +76,37 @@ def check(schema: pa.Schema, table: str, *, stage: bool = False) -> None:
         differences.append(f"schema version {facts[VERSION_KEY]}, this release knows version {TABLES[table].version}")
     if differences:
         raise SchemaMismatch(f"this is not the table {table}: {'; '.join(differences)}")
+
+
+def conform(rows: pa.Table, table: str, schema: pa.Schema | None = None, *, stage: bool = False) -> pa.Table:
+    """`rows` with exactly the columns and types of `schema` (default: those of `table`).
+
+    Integers and texts of another width are converted.
+
+    Raises
+    ------
+    SchemaMismatch
+        Columns are missing or additional, a conversion would lose something, or a column of the key holds nulls.
+    """
+    schema = arrow_schema(table, stage=stage) if schema is None else schema
+    missing = [name for name in schema.names if name not in rows.column_names]
+    extra = [name for name in rows.column_names if name not in schema.names]
+    if missing or extra:
+        raise SchemaMismatch(
+            f"these rows are not of the table {table}: missing {', '.join(missing) or 'nothing'}; "
+            f"not in the table: {', '.join(extra) or 'nothing'}"
+        )
+    columns = []
+    for field in schema:
+        column = rows.column(field.name)
+        if pa.types.is_integer(field.type) and pa.types.is_floating(column.type):
+            raise SchemaMismatch(f"column {field.name} of {table} must be whole numbers, not {column.type}")
+        try:
+            columns.append(column if column.type == field.type else column.cast(field.type))
+        except pa.ArrowException as error:
+            raise SchemaMismatch(f"column {field.name} of {table} cannot be {field.type}: {error}") from error
+    result = pa.Table.from_arrays(columns, schema=schema)
+    for name in table_key(table, stage=stage):
+        if nulls := result.column(name).null_count:
+            raise SchemaMismatch(f"column {name} of {table} identifies a row, yet {nulls} rows have none")
+    return result

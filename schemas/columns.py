@@ -41,6 +41,7 @@ T_NS = Column(
 SEGMENT = Column("segment", _I32, "1", "number of the excited stretch of the flight, from 0, in order of time")
 START_NS = Column("start_ns", _I64, "ns", "first sample of the segment, IMU clock")
 END_NS = Column("end_ns", _I64, "ns", "last sample of the segment, IMU clock")
+FROM_NS = Column("from_ns", _I64, "ns", "first sample that these constants had no part in, IMU clock")
 RATE_RMS = Column(
     "rate_rms", _F64, AS_LOGGED, "rms of the logged angular rate vector over the segment, its mean removed", "gyroscope"
 )

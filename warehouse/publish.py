@@ -76,7 +76,7 @@ def read_history(root: Path, table: str, vehicle_id: str) -> pl.DataFrame:
 def _prepared(table: str, rows: pl.DataFrame, vehicle_id: str, flights: frozenset[str]) -> pl.DataFrame:
     if table not in HISTORY_TABLES:
         raise SchemaMismatch(f"{table} is no table of the history; those are {', '.join(HISTORY_TABLES)}")
-    result = frame(conform(rows, table, schemas.arrow_schema(table)))
+    result = frame(conform(rows, table))
     _only(table, "vehicle", result["vehicle_id"], {vehicle_id})
     if table != "drift":
         _only(table, "flight", result["flight_id"], flights)

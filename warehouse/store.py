@@ -88,7 +88,7 @@ class TableWriter:
         SchemaMismatch
             Columns are missing, additional or of the wrong type, or a column of the key holds nulls.
         """
-        rows = conform(data, self.table, self._schema, stage=self._stage)
+        rows = schemas.conform(_arrow(data), self.table, self._schema, stage=self._stage)
         self._waiting.append(rows)
         self._n_waiting += rows.num_rows
         self.n_rows += rows.num_rows
@@ -143,10 +143,10 @@ def write_table(
 
 def table_bytes(data: Data, table: str) -> bytes:
     """The bytes `write_table` would write."""
-    schema = schemas.arrow_schema(table)
+    rows = conform(data, table)
     buffer = io.BytesIO()
-    with pq.ParquetWriter(buffer, schema, **_options(schema)) as parquet:
-        parquet.write_table(conform(data, table, schema).combine_chunks(), row_group_size=_ROWS_PER_GROUP)
+    with pq.ParquetWriter(buffer, rows.schema, **_options(rows.schema)) as parquet:
+        parquet.write_table(rows.combine_chunks(), row_group_size=_ROWS_PER_GROUP)
     return buffer.getvalue()
 
 
@@ -202,36 +202,9 @@ def frame(rows: pa.Table) -> pl.DataFrame:
     return result
 
 
-def conform(data: Data, table: str, schema: pa.Schema, *, stage: bool = False) -> pa.Table:
-    """`data` with exactly the columns and types of `schema`; integers and texts of another width are converted.
-
-    Raises
-    ------
-    SchemaMismatch
-        Columns are missing or additional, a conversion would lose something, or a column of the key holds nulls.
-    """
-    rows = _arrow(data)
-    missing = [name for name in schema.names if name not in rows.column_names]
-    extra = [name for name in rows.column_names if name not in schema.names]
-    if missing or extra:
-        raise SchemaMismatch(
-            f"these rows are not of the table {table}: missing {', '.join(missing) or 'nothing'}; "
-            f"not in the table: {', '.join(extra) or 'nothing'}"
-        )
-    columns = []
-    for field in schema:
-        column = rows.column(field.name)
-        if pa.types.is_integer(field.type) and pa.types.is_floating(column.type):
-            raise SchemaMismatch(f"column {field.name} of {table} must be whole numbers, not {column.type}")
-        try:
-            columns.append(column if column.type == field.type else column.cast(field.type))
-        except pa.ArrowException as error:
-            raise SchemaMismatch(f"column {field.name} of {table} cannot be {field.type}: {error}") from error
-    result = pa.Table.from_arrays(columns, schema=schema)
-    for name in schemas.table_key(table, stage=stage):
-        if nulls := result.column(name).null_count:
-            raise SchemaMismatch(f"column {name} of {table} identifies a row, yet {nulls} rows have none")
-    return result
+def conform(data: Data, table: str) -> pa.Table:
+    """`schemas.conform` of any form of data."""
+    return schemas.conform(_arrow(data), table)
 
 
 def _arrow(data: Data) -> pa.Table:

@@ -97,7 +97,7 @@ def verify_fit(tables: Tables, s: Settings) -> StageResult:
                 _rates_against_vps(add, method, signal, t, rate @ axes.T, vps, vps_t, s)
     joint = constants(tables["joint"], "gyroscope") if "joint" in tables else None
     if joint is not None and vps is not None and vps_t is not None:
-        q = matrix(tables["joint_attitude"], QUATERNION)
+        q = matrix(tables["trajectory"], QUATERNION)
         own, near = interpolate_attitude(t, continuous(q), vps_t)
         if near.any():
             add("attitude", "joint", "vps", "smoothed", theil_attitude(matrix(vps, QUATERNION)[near], own[near]), "deg")
@@ -106,7 +106,7 @@ def verify_fit(tables: Tables, s: Settings) -> StageResult:
             relative = propagate_stretches(t, rate, segment)
             _propagated_against_vps(add, "joint", signal, t, relative, segment, vps, vps_t, s)
             _rates_against_vps(add, "joint", signal, t, rate @ axes.T, vps, vps_t, s)
-    if "joint_held_out" in tables:
+    if "held_out" in tables:
         _held_out(add, tables, t, segment, vps, vps_t, s)
     if not rows:
         return StageResult(status="absent", reason_code="nothing_to_compare", reason="No reference to compare with.")
@@ -147,17 +147,17 @@ def _held_out(
 ) -> None:
     """Constants of the first part of the flight predict the rest: attitude over stretches, and body rates, against the
     VPS, else against the joint attitude of the whole flight."""
-    constants_then = constants(tables["joint_held_out"], "gyroscope")
+    constants_then = constants(tables["held_out"], "gyroscope")
     if constants_then is None:
         return
-    late = tables["samples"]["t_ns"].to_numpy() >= tables["joint_held_out"]["from_ns"][0]
+    late = tables["samples"]["t_ns"].to_numpy() >= tables["held_out"]["from_ns"][0]
     t, segment = t[late], segment[late]
     rate = sensor.calibrate(matrix(tables["samples"], triad("gyroscope"))[late], *constants_then)
     if vps is not None and vps_t is not None:
         name, reference_t, q = "vps", vps_t, matrix(vps, QUATERNION)
         rates = matrix(vps, RATE_COLUMNS)
-    elif "joint_attitude" in tables:
-        name, reference_t, q = "joint", t, matrix(tables["joint_attitude"], QUATERNION)[late]
+    elif "trajectory" in tables:
+        name, reference_t, q = "joint", t, matrix(tables["trajectory"], QUATERNION)[late]
         rates = None
     else:
         return

@@ -46,7 +46,7 @@ MAX_GYRO_NOISE_SHARE = 0.5
 
 
 def estimate_jointly(tables: Tables, s: Settings) -> StageResult:
-    """samples, serial constants → calibration, attitude, covariance, fit: everything in one likelihood."""
+    """samples, serial constants → calibration, covariance, trajectory, held_out: everything in one likelihood."""
     if not chosen(s):
         return StageResult(status="absent", reason_code="not_selected", reason='The method is "serial".')
     if "samples" not in tables:
@@ -205,7 +205,7 @@ def _written(fit: JointFit, tables: Tables, s: Settings, axes: Array) -> StageRe
     result = {"calibration": calibration_rows(rows), "covariance": covariance_table(fit.covariance)}
     full, _, covariance, _ = _triad(fit, "gyroscope")
     if not any(_judged("gyroscope", fit, np.diagonal(full), covariance, s)):
-        result["attitude"] = _attitude_table(fit, tables, axes)
+        result["trajectory"] = _trajectory(fit, tables, axes)
     return StageResult(result, "refused" if every else "ok", first, reason, measured)
 
 
@@ -343,15 +343,10 @@ def _measured(fit: JointFit, axes: Array) -> dict[str, Any]:
     return measured
 
 
-def _attitude_table(fit: JointFit, tables: Tables, axes: Array) -> pl.DataFrame:
-    """Attitude of the body and corrected rates of the sensor axes at every sample, weight 1."""
+def _trajectory(fit: JointFit, tables: Tables, axes: Array) -> pl.DataFrame:
+    """Attitude of the body at every sample."""
     samples = tables["samples"]
     q = multiply(fit.path.q, from_matrix(axes))
-    return pl.DataFrame(
-        {
-            "t_ns": samples["t_ns"],
-            "segment": samples["segment"],
-            **columns_of(q, QUATERNION),
-            "weight": np.ones(len(q)),
-        }
+    return samples.select("t_ns", "segment").with_columns(
+        **{name: pl.Series(values) for name, values in columns_of(q, QUATERNION).items()}
     )

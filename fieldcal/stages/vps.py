@@ -175,7 +175,9 @@ def _aligned(
     q = multiply(q, body)
     vps_rate = sensor_rotation(vps_rate, body)
     world = np.array([0.0, 0.0, 0.0, 1.0])
-    attitude = tables.get("joint_attitude", tables.get("attitude"))
+    attitude = tables.get("attitude")
+    if "trajectory" in tables:
+        attitude = tables["trajectory"].with_columns(weight=pl.lit(1.0))
     if attitude is not None:
         origin = int(tables["imu"]["t_ns"][0])
         own_t = seconds(attitude["t_ns"], origin)
