@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-import schemas
-from warehouse import Warehouse
-from warehouse.publish import publish
+from fieldcal import schemas
+from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.publish import publish
 
 SEED = 20260511
 START = datetime(2025, 1, 1, tzinfo=UTC)

@@ -17,11 +17,11 @@ import zstandard
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from fieldcal.configuration import load
+from fieldcal.config.configuration import load
 from fieldcal.logs import open_log
-from fieldcal.logs.mcap_file import McapFile
-from fieldcal.logs.mcap_records import CHUNK, HEAD_BYTES, MAGIC, Fields, read_chunk_head, read_record
-from fieldcal.logs.write_mcap import imu_channel, write_mcap
+from fieldcal.logs.mcap.file import McapFile
+from fieldcal.logs.mcap.records import CHUNK, HEAD_BYTES, MAGIC, Fields, read_chunk_head, read_record
+from fieldcal.logs.mcap.write import imu_channel, write_mcap
 
 CHUNK_BYTES = 1 << 20
 

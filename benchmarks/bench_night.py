@@ -24,8 +24,8 @@ VEHICLES, SESSIONS = 3, 10
 
 def simulate(archive: Path, flights: int) -> None:
     """Three vehicles, ten sessions, as many flights each as needed; those too many are removed."""
-    from fieldcal.simulate import Experiment
-    from fieldcal.simulate_logs import write_flights
+    from fieldcal.simulation.archive import write_flights
+    from fieldcal.simulation.experiment import Experiment
 
     each = -(-flights // (VEHICLES * SESSIONS))
     logs = write_flights(archive, Experiment(seed=1), vehicles=VEHICLES, sessions=SESSIONS, flights=each)
@@ -38,7 +38,7 @@ def night(archive: Path, root: Path, workers: int) -> dict[str, Any]:
     began = time.monotonic()
     command = ["nightly", str(archive), "--warehouse", str(root), "--workers", str(workers), "--json"]
     told = subprocess.run(
-        [sys.executable, "-m", "flows.cli", *command], cwd=REPOSITORY, capture_output=True, text=True, check=True
+        [sys.executable, "-m", "fieldcal", *command], cwd=REPOSITORY, capture_output=True, text=True, check=True
     )
     return {**json.loads(told.stdout), "wall": time.monotonic() - began}
 

@@ -18,9 +18,10 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import numpy as np
 
-from fieldcal import attitude, ellipsoid, gyro_equation, gyro_output, smoothing
-from fieldcal.gyro_equation import GyroFit
-from fieldcal.simulate import SCALE, Recording, simulate
+from fieldcal.estimation import ellipsoid, smoothing, wahba
+from fieldcal.estimation.gyroscope import equation_error, output_error
+from fieldcal.estimation.gyroscope.equation_error import GyroFit
+from fieldcal.simulation.experiment import SCALE, Recording, simulate
 
 REFERENCE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -48,10 +49,10 @@ def chain(r: Recording, *, method: str, equations: str, output: bool) -> GyroFit
         fit = ellipsoid.fit_ellipsoid(source[name], magnitude, method=method, polarity=np.sign(SCALE[name]))
         vectors.append(fit.apply(smooth[name]))
         sigma.append(max(fit.residual_rms, 1e-4))
-    q = attitude.attitudes(np.stack(vectors, axis=1), REFERENCE, np.array(sigma)).q
+    q = wahba.attitudes(np.stack(vectors, axis=1), REFERENCE, np.array(sigma)).q
     q_dot = smoothing.differentiate_samples(r.t, q, window_s=0.027)
-    start = gyro_equation.fit_equation_error(q, q_dot, smooth["gyroscope"], equations=equations)
-    return gyro_output.fit_output_error(r.t, q, raw["gyroscope"], start, stretch_s=5.0) if output else start
+    start = equation_error.fit_equation_error(q, q_dot, smooth["gyroscope"], equations=equations)
+    return output_error.fit_output_error(r.t, q, raw["gyroscope"], start, stretch_s=5.0) if output else start
 
 
 def quest_rates(n: int = 200_000, n_ahrs: int = 2_000) -> tuple[float, float]:
@@ -61,9 +62,9 @@ def quest_rates(n: int = 200_000, n_ahrs: int = 2_000) -> tuple[float, float]:
     recording = simulate(seed=1)
     times = -(-n // len(recording.q))
     q = np.tile(recording.q, (times, 1))[:n]
-    observed = np.stack([attitude.rotate_reference(q, v) for v in REFERENCE], axis=1)
+    observed = np.stack([wahba.rotate_reference(q, v) for v in REFERENCE], axis=1)
     observed += 0.005 * np.random.default_rng(1).normal(size=observed.shape)
-    ours = n / best_of_five(lambda: attitude.attitudes(observed, REFERENCE, np.array([0.005, 0.005])))
+    ours = n / best_of_five(lambda: wahba.attitudes(observed, REFERENCE, np.array([0.005, 0.005])))
     magnetic, gravity = observed[:n_ahrs, 0].copy(), observed[:n_ahrs, 1].copy()
     theirs = n_ahrs / best_of_five(lambda: QUEST(acc=gravity, mag=magnetic, magnetic_dip=0.0))
     return ours, theirs

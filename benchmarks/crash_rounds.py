@@ -27,7 +27,7 @@ BEFORE, AFTER = "before", "after"
 NIGHT = """
 import os, signal, sys
 from pathlib import Path
-import warehouse.files as files
+from fieldcal.warehouse import files
 
 archive, root, side, number = sys.argv[1:5]
 real, seen = files.AtomicFile.commit, 0
@@ -45,7 +45,7 @@ def commit(self):
     return sha256
 
 files.AtomicFile.commit = commit
-from flows.night import run_night
+from fieldcal.flows.run import run_night
 run_night(Path(archive), Path(root))
 print(seen)
 """
@@ -88,12 +88,12 @@ def main() -> None:
     arguments.add_argument("--flights", type=int, default=1)
     given = arguments.parse_args()
 
-    from fieldcal.simulate import Experiment
-    from fieldcal.simulate_logs import write_flights
-    from flows.night import run_night
-    from flows.server import running_server
-    from warehouse.content import content_sha256
-    from warehouse.verify import verify
+    from fieldcal.flows.run import run_night
+    from fieldcal.flows.server import running_server
+    from fieldcal.simulation.archive import write_flights
+    from fieldcal.simulation.experiment import Experiment
+    from fieldcal.warehouse.content import content_sha256
+    from fieldcal.warehouse.verify import verify
 
     with tempfile.TemporaryDirectory() as folder, running_server(Path(folder) / "server") as server:
         server.wait()

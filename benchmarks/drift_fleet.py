@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal.simulate import BIAS, MID_SCALE, SCALE, SENSORS, Experiment, simulate
-from fieldcal.simulate_logs import write_flight
-from flows.drift import table_of, update_drift
-from warehouse import Warehouse
+from fieldcal.simulation.archive import write_flight
+from fieldcal.simulation.experiment import BIAS, MID_SCALE, SCALE, SENSORS, Experiment, simulate
+from fieldcal.trends.drift_table import table_of, update_drift
+from fieldcal.warehouse import Warehouse
 
 UNITS, SESSIONS = 12, 24
 START = dt.datetime(2026, 1, 12, 8, 0, tzinfo=dt.UTC)
@@ -132,9 +132,7 @@ def _frame(
             "sd": sd.ravel(),
             "temperature_degc": warm[u, k],
         }
-    ).with_columns(
-        sensor=pl.lit(sensor), method=pl.lit(method), parameter=pl.lit(parameter), unit=pl.lit(unit)
-    )
+    ).with_columns(sensor=pl.lit(sensor), method=pl.lit(method), parameter=pl.lit(parameter), unit=pl.lit(unit))
 
 
 def write_logs(fleet: Fleet, archive: Path, seed: int, duration_s: float) -> int:
@@ -268,7 +266,7 @@ def as_logs(folder: Path, seed: int, duration_s: float, workers: int) -> None:
         begun = time.monotonic()
         print(f"{write_logs(fleet, archive, seed, duration_s)} logs in {time.monotonic() - begun:.0f} s", flush=True)
     begun = time.monotonic()
-    command = [sys.executable, "-m", "flows.cli", "nightly", str(archive), "--warehouse", str(root), "--json"]
+    command = [sys.executable, "-m", "fieldcal", "nightly", str(archive), "--warehouse", str(root), "--json"]
     done = subprocess.run([*command, "--workers", str(workers)], stdout=subprocess.PIPE, check=False)
     if done.returncode not in (0, 3):
         raise SystemExit(f"fieldcal nightly ended with {done.returncode}")

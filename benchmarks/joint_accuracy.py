@@ -23,15 +23,15 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal import joint_start
-from fieldcal.frames import AXES, QUATERNION, constants, matrix
-from fieldcal.joint import JointFit, fit_joint
-from fieldcal.joint_record import Readings
-from fieldcal.pipeline import run_flight
-from fieldcal.results import StageResult
-from fieldcal.rotation import angle_between
-from fieldcal.simulate import SENSORS, Experiment, Recording, constants_at, simulate
-from fieldcal.simulate_logs import settings, signals
+from fieldcal.estimation.joint import initialise
+from fieldcal.estimation.joint.fit import JointFit, fit_joint
+from fieldcal.estimation.joint.problem import Readings
+from fieldcal.geometry.rotation import angle_between
+from fieldcal.simulation.archive import settings, signals
+from fieldcal.simulation.experiment import SENSORS, Experiment, Recording, constants_at, simulate
+from fieldcal.stages.pipeline import run_flight
+from fieldcal.stages.results import StageResult
+from fieldcal.stages.tables import AXES, QUATERNION, constants, matrix
 
 MOVING = Experiment(translation_rms_mps2=0.3, lever_arm_m=(0.05, 0.02, -0.03))
 STEEP = replace(MOVING, dip_rad=float(np.radians(65.0)))
@@ -40,9 +40,7 @@ CASES = {
     "translation": MOVING,
     "translation, 65° dip": STEEP,
     "hard": replace(STEEP, magnetic_bursts=4, gyro_random_walk=0.002, lost_share=0.01),
-    "vps": replace(
-        MOVING, vps_dropout_share=0.1, vps_outlier_share=0.01, vps_skew_ppm=200.0, vps_misalignment_rad=0.1
-    ),
+    "vps": replace(MOVING, vps_dropout_share=0.1, vps_outlier_share=0.01, vps_skew_ppm=200.0, vps_misalignment_rad=0.1),
 }
 SOURCES = {
     "serial": {"magnetometer": "magnetometer", "accelerometer": "accelerometer_pass2", "gyroscope": "gyro_output"},
@@ -166,14 +164,12 @@ def _fit_alone(r: Recording, results: dict[str, StageResult] | None) -> JointFit
         **r.counts,
         gravity_mps2=r.experiment.gravity_mps2,
         field_ned=np.array([1.0, 0.0, 0.0]),
-        turning=joint_start.turning(r.t, segment, r.counts["gyroscope"]),
+        turning=initialise.turning(r.t, segment, r.counts["gyroscope"]),
     )
-    return fit_joint(*joint_start.prepare(readings, _start(r, readings, results)))
+    return fit_joint(*initialise.prepare(readings, _start(r, readings, results)))
 
 
-def _start(
-    r: Recording, readings: Readings, results: dict[str, StageResult] | None
-) -> dict[str, joint_start.Constants]:
+def _start(r: Recording, readings: Readings, results: dict[str, StageResult] | None) -> dict[str, initialise.Constants]:
     """The serial result where there is one, else the estimator's own start."""
     if results is not None:
         tables = {name: results[SOURCES["serial"][name]].tables["calibration"] for name in SENSORS}
@@ -181,8 +177,8 @@ def _start(
         return {name: (np.diagonal(own[0]).copy(), own[1]) for name, own in found.items() if own is not None}
     sign = {name: np.sign(r.experiment.scale[name]) for name in SENSORS}
     own = {
-        "magnetometer": joint_start.start_of_triad(r.counts["magnetometer"], 1.0, sign["magnetometer"]),
-        "accelerometer": joint_start.start_of_triad(
+        "magnetometer": initialise.start_of_triad(r.counts["magnetometer"], 1.0, sign["magnetometer"]),
+        "accelerometer": initialise.start_of_triad(
             r.counts["accelerometer"], r.experiment.gravity_mps2, sign["accelerometer"]
         ),
     }

@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from fieldcal import ingest
-from fieldcal.configuration import load
-from fieldcal.frames import AXES, QUATERNION, matrix, seconds, triad
-from fieldcal.gyro_output import propagate_stretches, start_stretches
-from fieldcal.pipeline import run_flight
-from fieldcal.results import StageResult
-from fieldcal.rotation import angle_between, slerp
+from fieldcal.config.configuration import load
+from fieldcal.estimation.gyroscope.output_error import propagate_stretches, start_stretches
+from fieldcal.geometry.rotation import angle_between, slerp
+from fieldcal.logs import ingest
 from fieldcal.stages.attitude import sensor_attitude
+from fieldcal.stages.pipeline import run_flight
+from fieldcal.stages.results import StageResult
+from fieldcal.stages.tables import AXES, QUATERNION, matrix, seconds, triad
 from fieldcal.stages.vps import bridged
 
 

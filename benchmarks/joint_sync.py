@@ -16,9 +16,9 @@ import polars as pl
 from joint_accuracy import CASES as ALL
 from joint_accuracy import flights_of
 
-from fieldcal.pipeline import run_flight
-from fieldcal.simulate import Recording, simulate
-from fieldcal.simulate_logs import settings, signals
+from fieldcal.simulation.archive import settings, signals
+from fieldcal.simulation.experiment import Recording, simulate
+from fieldcal.stages.pipeline import run_flight
 
 CASES = {
     "no translation": ALL["clean"],

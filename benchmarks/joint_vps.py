@@ -14,7 +14,7 @@ from collections import defaultdict
 import numpy as np
 from joint_accuracy import CASES, flights_of, measure
 
-from fieldcal.simulate import SENSORS, simulate
+from fieldcal.simulation.experiment import SENSORS, simulate
 
 SHOWN = (
     *(f"scale {sensor}" for sensor in SENSORS),

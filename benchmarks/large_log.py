@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from fieldcal.logs.write_mcap import encode_cdr, imu_channel, magnetic_field_channel
+from fieldcal.logs.mcap.write import encode_cdr, imu_channel, magnetic_field_channel
 
 START_NS = 1_767_225_600_000_000_000
 RATE_HZ = 200
@@ -64,9 +64,9 @@ def write_log(path: Path, size: int, kind: str) -> int:
 
 def ingest(path: Path, root: Path) -> None:
     """Ingest a log and print what it took."""
-    from fieldcal.configuration import load
-    from flows.jobs import Job, file_stamp
-    from flows.steps import FlightWork
+    from fieldcal.batch.steps import FlightWork
+    from fieldcal.config.configuration import load
+    from fieldcal.flight.job import Job, file_stamp
 
     start = time.perf_counter()
     job = Job(str(path), path.name, "large", "s", "mcap", "0" * 64, "large", file_stamp(path))
@@ -103,7 +103,6 @@ def main(gigabytes: float = 2.0, kind: str = "camera") -> None:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(REPOSITORY))
     if sys.argv[1:2] == ["--ingest"]:
         ingest(Path(sys.argv[2]), Path(sys.argv[3]))
     else:

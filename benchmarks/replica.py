@@ -16,17 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from fieldcal import smoothing
-from fieldcal.frames import QUATERNION, constants, matrix, seconds, triad
-from fieldcal.gyro_equation import predicted_quaternion_rate
-from fieldcal.gyro_output import propagate_stretches, start_stretches
-from fieldcal.parameters import PROFILES
-from fieldcal.pipeline import run_flight
-from fieldcal.results import StageResult
-from fieldcal.rotation import Array, continuous, euler_angles
-from fieldcal.sensor import calibrate
-from fieldcal.simulate import Experiment, Recording, simulate
-from fieldcal.simulate_logs import settings, signals
+from fieldcal.config.parameters import PROFILES
+from fieldcal.estimation import smoothing
+from fieldcal.estimation.gyroscope.equation_error import predicted_quaternion_rate
+from fieldcal.estimation.gyroscope.output_error import propagate_stretches, start_stretches
+from fieldcal.geometry.rotation import Array, continuous, euler_angles
+from fieldcal.geometry.sensor_model import calibrate
+from fieldcal.simulation.archive import settings, signals
+from fieldcal.simulation.experiment import Experiment, Recording, simulate
+from fieldcal.stages.pipeline import run_flight
+from fieldcal.stages.results import StageResult
+from fieldcal.stages.tables import QUATERNION, constants, matrix, seconds, triad
 from fieldcal.stages.vps import RATE_COLUMNS
 
 PRINTED = {

@@ -16,12 +16,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import polars as pl
 
-from fieldcal.frames import AXES, QUATERNION, matrix
-from fieldcal.parameters import PROFILES
-from fieldcal.pipeline import run_flight
-from fieldcal.rotation import angle_between
-from fieldcal.simulate import Experiment, Recording, simulate
-from fieldcal.simulate_logs import settings, signals, truth
+from fieldcal.config.parameters import PROFILES
+from fieldcal.geometry.rotation import angle_between
+from fieldcal.simulation.archive import settings, signals, truth
+from fieldcal.simulation.experiment import Experiment, Recording, simulate
+from fieldcal.stages.pipeline import run_flight
+from fieldcal.stages.tables import AXES, QUATERNION, matrix
 
 WHERE = {
     "magnetometer": ("magnetometer", None),

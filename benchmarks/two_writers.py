@@ -23,7 +23,7 @@ def at_once(archive: Path, session: Path, root: Path) -> list[int]:
     commands = (["nightly", str(archive)], ["session", str(session)])
     processes = [
         subprocess.Popen(
-            [sys.executable, "-m", "flows.cli", *command, "--warehouse", str(root)],
+            [sys.executable, "-m", "fieldcal", *command, "--warehouse", str(root)],
             cwd=REPOSITORY,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -39,12 +39,12 @@ def main() -> None:
     arguments.add_argument("--rounds", type=int, default=20)
     given = arguments.parse_args()
 
-    from fieldcal.simulate import Experiment
-    from fieldcal.simulate_logs import write_flights
-    from flows.night import run_night
-    from flows.server import running_server
-    from warehouse.content import content_sha256
-    from warehouse.verify import verify
+    from fieldcal.flows.run import run_night
+    from fieldcal.flows.server import running_server
+    from fieldcal.simulation.archive import write_flights
+    from fieldcal.simulation.experiment import Experiment
+    from fieldcal.warehouse.content import content_sha256
+    from fieldcal.warehouse.verify import verify
 
     with tempfile.TemporaryDirectory() as folder, running_server(Path(folder) / "server") as server:
         server.wait()

@@ -48,3 +48,10 @@ class UnusableFlight(FieldcalError):
 
 class EstimationError(FieldcalError):
     """Enough information, yet the estimator reached no minimum."""
+
+
+def unforeseen(log_uri: str, error: Exception) -> str:
+    """What an unforeseen error says to people."""
+    told = " ".join(str(error).split())
+    what = f"{type(error).__name__}: {told[:300]}"
+    return f"an error of fieldcal's own stopped it on {log_uri} ({what}). Please report it."

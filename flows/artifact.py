@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from flows.outcome import VERDICTS
+from fieldcal.batch.outcome import VERDICTS
+from fieldcal.trends.changes import Change
 
 KEY = "fieldcal-night"
 MOST_ROWS = 500
+
+EVENT = "fieldcal.fleet.changed"
 
 
 def keep_artifact(result: Mapping[str, Any], root: Path) -> None:
@@ -30,7 +33,7 @@ def keep_artifact(result: Mapping[str, Any], root: Path) -> None:
     try:
         create_table_artifact(table=rows[:MOST_ROWS], key=KEY, description=told)
     except Exception as error:
-        from flows.show import say
+        from fieldcal.words.talk import say
 
         say(f"Prefect keeps no table of this night ({type(error).__name__}); the warehouse has it all.")
 
@@ -39,3 +42,16 @@ def _rows(log: Mapping[str, Any]) -> list[dict[str, Any]]:
     own = [] if log["verdict"] == "ok" else [{"what": log["verdict"], "why": log["reason"] or log["reason_code"]}]
     refused = [{"what": f"{r['stage']} {r['status']}", "why": r["reason"] or r["reason_code"]} for r in log["refusals"]]
     return [{"log": log["log_uri"], **row} for row in own + refused]
+
+
+def tell_prefect(told: Sequence[Change]) -> None:
+    """Emit `fieldcal.fleet.changed`, on which an automation can act; without news nothing is emitted."""
+    if not told:
+        return
+    from prefect.events import emit_event
+
+    emit_event(
+        event=EVENT,
+        resource={"prefect.resource.id": "fieldcal.fleet"},
+        payload={"changes": [change.row() for change in told]},
+    )

@@ -14,11 +14,11 @@ from prefect.schedules import Cron
 from prefect.settings import PREFECT_API_URL
 from prefect.types.entrypoint import EntrypointType
 
+from fieldcal.batch.landing import Landing
 from fieldcal.errors import FieldcalError
-from flows.landing import Landing
-from flows.nightly import nightly, session
-from flows.show import say
-from flows.trigger import DEPLOYMENT, EVENT, trigger
+from fieldcal.flows.nightly import nightly, session
+from fieldcal.flows.trigger import DEPLOYMENT, EVENT, trigger
+from fieldcal.words.talk import say
 
 AT_ONCE = 2
 LOOK_EVERY_S = 5.0

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from uuid import UUID
 
-from flows.alive import dead
+from fieldcal.flows.alive import dead
 
 if TYPE_CHECKING:
     from prefect.client.orchestration import SyncPrefectClient

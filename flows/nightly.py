@@ -21,27 +21,29 @@ from prefect.client.schemas.objects import State, StateDetails
 from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.states import Completed
 
-from fieldcal.configuration import Configuration
-from flows.alive import alive
-from flows.artifact import keep_artifact
-from flows.closing import close_night, tell_prefect
-from flows.flights import flights, lost, one_step
-from flows.history import publish_vehicle, withdraw
-from flows.jobs import Job, Source, configuration_of, find_source
-from flows.log_ledger import write_ledger
-from flows.outcome import Outcome, summary
-from flows.plan import Plan, make_plan
-from flows.pool import hand_over, pool_answers
-from flows.processes import process_answers, processes_begun, spawned
-from flows.runners import Answers, Parallel, batches, dask_answers
-from flows.show import say
-from flows.source_ledger import know_sources
-from flows.steps import FlightWork, Record, code_digest
-from flows.watching import Watcher, tell_done, tell_plan, watch
-from warehouse import Warehouse
-from warehouse.errors import WarehouseError
-from warehouse.files import remove_abandoned
-from warehouse.layout import prepare
+from fieldcal.batch.closing import close_night
+from fieldcal.batch.flights import flights, lost, one_step
+from fieldcal.batch.log_ledger import write_ledger
+from fieldcal.batch.outcome import Outcome, summary
+from fieldcal.batch.plan import Plan, make_plan
+from fieldcal.batch.publish_flights import publish_vehicle, withdraw
+from fieldcal.batch.source_ledger import know_sources
+from fieldcal.batch.steps import FlightWork, Record
+from fieldcal.config.configuration import Configuration
+from fieldcal.config.find import Source, configuration_of, find_source
+from fieldcal.flight.job import Job
+from fieldcal.flows.alive import alive
+from fieldcal.flows.artifact import keep_artifact, tell_prefect
+from fieldcal.flows.pool import hand_over, pool_answers
+from fieldcal.flows.processes import process_answers, processes_begun, spawned
+from fieldcal.flows.runners import Answers, Parallel, batches, dask_answers
+from fieldcal.flows.watching import Watcher, tell_done, tell_plan, watch
+from fieldcal.stages.run_key import code_digest
+from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.errors import WarehouseError
+from fieldcal.warehouse.files import remove_abandoned
+from fieldcal.warehouse.layout import prepare
+from fieldcal.words.talk import say
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ def run_step(flight_id: str, step: str, log_uri: str) -> State[Any]:
 
 @task(name="batch", task_run_name="batch {number}", cache_policy=NO_CACHE, persist_result=False)
 def run_batch(number: int, root: str, source: Source, jobs: list[dict[str, Any]], code: str) -> dict[str, Any]:
-    """A batch of flights, every step a task (`flows.flights.flights`)."""
+    """A batch of flights, every step a task (`fieldcal.batch.flights.flights`)."""
     return flights(root, source, jobs, code, _as_task, tell_done)
 
 
@@ -112,12 +114,12 @@ def nightly(
     archive, warehouse, config
         Folder of logs, data root, `fieldcal.toml` if not the archive's own.
     workers, runner, scheduler
-        Where the batches of flights run (`flows.runners.task_runner`); results do not depend on it.
+        Where the batches of flights run (`fieldcal.flows.runners.task_runner`); results do not depend on it.
 
     Returns
     -------
     dict
-        The JSON of the night (`flows.outcome.summary`).
+        The JSON of the night (`fieldcal.batch.outcome.summary`).
 
     Raises
     ------

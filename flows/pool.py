@@ -13,8 +13,8 @@ from typing import Any
 from uuid import uuid4
 
 from fieldcal.errors import FieldcalError
-from warehouse.files import write_bytes
-from warehouse.sealed import BrokenSeal, seal, unseal
+from fieldcal.warehouse.files import write_bytes
+from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 
 BATCH_DEPLOYMENT = "batch/fieldcal"
 LOOK_EVERY_S = 1.0

@@ -1,6 +1,6 @@
 """Batches in spawned processes of this machine, within the night's flow run.
 
-A module of its own, because Prefect may load `flows.nightly` under another name, which other processes would not find.
+A module of its own, because Prefect may load `nightly` under another name, which other processes would not find.
 Each process tells Prefect's server of its tasks itself: through this one every event would be sent twice.
 """
 
@@ -13,7 +13,7 @@ from importlib import import_module
 from multiprocessing import get_context
 from typing import Any
 
-from flows.runners import Answers, answer_of
+from fieldcal.flows.runners import Answers, answer_of
 
 LISTEN_S = 0.25
 
@@ -61,14 +61,14 @@ def _context() -> dict[str, Any]:
 
 
 def _import() -> None:
-    import_module("flows.nightly")
+    import_module("fieldcal.flows.nightly")
 
 
 def _batch(context: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
     """One batch, in one of the processes."""
     from prefect.context import hydrated_context
 
-    from flows import nightly
+    from fieldcal.flows import nightly
 
     run = context["flow_run_context"]
     flow = {own.name: own for own in (nightly.nightly, nightly.session)}[run["flow"]]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from fieldcal.errors import FieldcalError
-from flows.jobs import Job
+from fieldcal.flight.job import Job
 
 if TYPE_CHECKING:
     from prefect import Task

@@ -22,6 +22,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import fieldcal
 from fieldcal.errors import FieldcalError
 
 START_TIMEOUT_S = 180.0
@@ -58,6 +59,7 @@ def prepare_environment(root: Path, *, serving: bool = False) -> None:
     """Settings that Prefect reads when it is imported; what the user has set stays. Its files go below `root`."""
     for name, value in QUIET.items():
         os.environ.setdefault(name, value)
+    os.environ["PYTHONSAFEPATH"] = "1"  # for processes started from here: what lies in the current folder is not ours
     home = home_of(root, serving=serving)
     os.environ.setdefault("PREFECT_HOME", str(home))
     if Path(os.environ["PREFECT_HOME"]) == home:
@@ -155,7 +157,15 @@ class Server:
         extra = {**EMBEDDED, **(FOR_SERVING if self._serving else FOR_A_COMMAND)}
         with (self._home / "server.log").open("ab") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "flows.server_process", str(port), str(self._home / USERS), *self._kind()],
+                [
+                    sys.executable,
+                    "-P",
+                    "-m",
+                    "fieldcal.flows.server_process",
+                    str(port),
+                    str(self._home / USERS),
+                    *self._kind(),
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -239,5 +249,5 @@ def _free_port() -> int:
 
 
 def _python_path() -> str:
-    here = str(Path(__file__).resolve().parent.parent)
+    here = str(Path(fieldcal.__file__).parents[1])
     return os.pathsep.join([here, *filter(None, [os.environ.get("PYTHONPATH")])])

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fieldcal.errors import FieldcalError
-from flows.server import answers, no_answer, serving_address
-from warehouse.files import file_sha256
+from fieldcal.flows.server import answers, no_answer, serving_address
+from fieldcal.warehouse.files import file_sha256
 
 if TYPE_CHECKING:
     from prefect.client.orchestration import SyncPrefectClient

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from flows.outcome import Outcome
+from fieldcal.batch.outcome import Outcome
 
 
 class Watcher(Protocol):

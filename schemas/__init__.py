@@ -4,9 +4,12 @@
 with it, `python -m schemas` prints the data dictionary.
 """
 
-from schemas.arrow import SchemaMismatch, arrow_schema, check, conform
-from schemas.column import AS_LOGGED, Column, Table
-from schemas.tables import (
+if __name__ != "fieldcal.schemas":  # a checkout has this folder at its root too: two copies of every flow and enum
+    raise ImportError("This package is fieldcal.schemas.")
+
+from fieldcal.schemas.arrow import SchemaMismatch, arrow_schema, check, conform
+from fieldcal.schemas.column import AS_LOGGED, Column, Table
+from fieldcal.schemas.tables import (
     HISTORY_TABLES,
     SIGNAL_TABLES,
     STAGE_TABLES,

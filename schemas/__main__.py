@@ -3,7 +3,7 @@
 import os
 import sys
 
-from schemas.dictionary import data_dictionary
+from fieldcal.schemas.dictionary import data_dictionary
 
 try:
     print(data_dictionary(), flush=True)

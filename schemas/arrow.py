@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import pyarrow as pa
 
-from schemas.column import AS_LOGGED
-from schemas.tables import TABLES, table_columns, table_key
+from fieldcal.schemas.column import AS_LOGGED
+from fieldcal.schemas.tables import TABLES, table_columns, table_key
 
 TABLE_KEY = "fieldcal.table"
 VERSION_KEY = "fieldcal.schema_version"

@@ -18,7 +18,7 @@ class Column:
     """One column: its name, Arrow type, unit and meaning.
 
     `unit` is "" only for text, flags and dates; "1" says dimensionless. `sensor` names the sensor whose logged unit
-    the column carries. `provenance` marks columns that say how a result came to be rather than what it is: they do
+    the column carries. `stages.run_key` marks columns that say how a result came to be rather than what it is: they do
     not enter the content hash.
     """
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pyarrow as pa
 
-from schemas.column import AS_LOGGED, Column
+from fieldcal.schemas.column import AS_LOGGED, Column
 
 _F64 = pa.float64()
 _I32 = pa.int32()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from schemas.column import Table
-from schemas.tables import TABLES
+from fieldcal.schemas.column import Table
+from fieldcal.schemas.tables import TABLES
 
 _TITLES = {
     "signal": "Signals: readings as logged",

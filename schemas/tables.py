@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from schemas import columns as c
-from schemas.column import Column, Table
+from fieldcal.schemas import columns as c
+from fieldcal.schemas.column import Column, Table
 
 _HISTORY_FLIGHT_KEY = ("flight_id",)
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from flows.server import Server, prepare_environment
+from fieldcal.flows.server import Server, prepare_environment
+
+# Studies that are run by hand have parts that are tested.
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,7 @@ import numpy as np
 import polars as pl
 from logs_support import Flight, vehicle
 
-from fieldcal.ingest import read_flight
+from fieldcal.logs.ingest import read_flight
 
 SAMPLES = 400
 CHUNK_BYTES = 30_000

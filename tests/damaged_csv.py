@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fieldcal.configuration import CsvMap
+from fieldcal.config.configuration import CsvMap
 
 OK, LOSSY, CONTRADICTORY, NOTHING = ("ok",), ("partial",), ("quarantined",), ("rejected",)
 NAMES = ("t_s", "gx", "gy", "gz", "ax", "ay", "az")

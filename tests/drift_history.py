@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from history_rows import START, rows
 
-from warehouse.publish import publish
+from fieldcal.warehouse.publish import publish
 
 TAU, SD, PER_DEGC = 1e-3, 2e-4, 5e-5
 """rad/s, rad/s, rad/s per °C"""

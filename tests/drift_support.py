@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numerics_support import Array
 
-from fieldcal.histories import Histories
+from fieldcal.trends.series import Histories
 
 TAU, SD = 1.0, 0.4
 VALUE, PER_DEGC, PER_DAY = 100.0, 0.2, 0.0

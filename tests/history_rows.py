@@ -7,7 +7,7 @@ from typing import Any
 
 import polars as pl
 
-import schemas
+from fieldcal import schemas
 
 START = dt.datetime(2026, 5, 4, 12, 0, tzinfo=dt.UTC)
 

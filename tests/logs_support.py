@@ -13,8 +13,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from fieldcal.configuration import CsvMap, McapMap, Vehicle, load
-from fieldcal.logs import write_mcap as mcap_writer
+from fieldcal.config.configuration import CsvMap, McapMap, Vehicle, load
+from fieldcal.logs.mcap import write as mcap_writer
 
 EPOCH_NS = 1_700_000_000_000_000_000
 EXAMPLES = os.environ.get("FIELDCAL_EXAMPLE_LOGS")

@@ -10,8 +10,8 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike, NDArray
 from scipy import signal
 
-from fieldcal.rotation import from_rotation_vector, propagate
-from fieldcal.simulate import BIAS, SCALE
+from fieldcal.geometry.rotation import from_rotation_vector, propagate
+from fieldcal.simulation.experiment import BIAS, SCALE
 
 Array = NDArray[np.floating[Any]]
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from history_rows import START, rows
 
-from warehouse.publish import publish
+from fieldcal.warehouse.publish import publish
 
 REFERENCE_DEGC = 25.0
 SIGMA = {"scale": 2e-7, "zero_bias": 0.004, "bias": 0.006, "zero": 12.0}

@@ -11,10 +11,10 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from warehouse.errors import disk
-from warehouse.files import file_sha256, write_bytes
-from warehouse.layout import checksum_path, history_files
-from warehouse.sealed import BrokenSeal, seal, unseal
+from fieldcal.warehouse.errors import disk
+from fieldcal.warehouse.files import file_sha256, write_bytes
+from fieldcal.warehouse.layout import checksum_path, history_files
+from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 
 
 @contextmanager

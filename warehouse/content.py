@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-import schemas
-from warehouse.layout import history_files
-from warehouse.store import read_table
+from fieldcal import schemas
+from fieldcal.warehouse.layout import history_files
+from fieldcal.warehouse.store import read_table
 
 _JSON_COLUMNS = ("measured", "findings")
 

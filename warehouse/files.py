@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Self, TypeAlias
 from uuid import uuid4
 
-from warehouse.errors import disk
+from fieldcal.warehouse.errors import disk
 
 TEMPORARY = ".tmp"
 _ABANDONED_AFTER_S = 60.0

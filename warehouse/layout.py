@@ -13,8 +13,8 @@ import re
 import string
 from pathlib import Path
 
-from schemas import HISTORY_TABLES, SIGNAL_TABLES
-from warehouse.errors import disk
+from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES
+from fieldcal.warehouse.errors import disk
 
 _PLAIN = frozenset(f"{string.ascii_letters}{string.digits}._-".encode())
 _AS_IT_IS = re.compile(r"[A-Za-z0-9-][A-Za-z0-9._-]{0,149}")

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from warehouse.errors import WarehouseError, disk
-from warehouse.layout import lock_path, prepare
+from fieldcal.warehouse.errors import WarehouseError, disk
+from fieldcal.warehouse.layout import lock_path, prepare
 
 _RETRY_S = 0.02
 

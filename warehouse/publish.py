@@ -9,14 +9,14 @@ from pathlib import Path
 
 import polars as pl
 
-import schemas
-from schemas import HISTORY_TABLES, SchemaMismatch
-from warehouse import checksums
-from warehouse.errors import WarehouseError, disk
-from warehouse.files import write_bytes
-from warehouse.layout import checksum_path, history_path
-from warehouse.lock import vehicle_lock
-from warehouse.store import conform, empty_frame, frame, read_arrow, read_table, table_bytes
+from fieldcal import schemas
+from fieldcal.schemas import HISTORY_TABLES, SchemaMismatch
+from fieldcal.warehouse import checksums
+from fieldcal.warehouse.errors import WarehouseError, disk
+from fieldcal.warehouse.files import write_bytes
+from fieldcal.warehouse.layout import checksum_path, history_path
+from fieldcal.warehouse.lock import vehicle_lock
+from fieldcal.warehouse.store import conform, empty_frame, frame, read_arrow, read_table, table_bytes
 
 _ORDER = (*(name for name in HISTORY_TABLES if name != "flight"), "flight")
 

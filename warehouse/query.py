@@ -9,10 +9,10 @@ from typing import Any
 
 import polars as pl
 
-from schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES
-from warehouse.layout import encode_id, history_files, history_path, signal_files, signal_path
-from warehouse.signals import signal_ids
-from warehouse.store import empty_frame
+from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES
+from fieldcal.warehouse.layout import encode_id, history_files, history_path, signal_files, signal_path
+from fieldcal.warehouse.signals import signal_ids
+from fieldcal.warehouse.store import empty_frame
 
 DEFAULT_ROOT = "fieldcal-data"
 
@@ -54,14 +54,14 @@ class Warehouse:
         return frame if flight_id is None else frame.filter(pl.col("flight_id") == flight_id)
 
     def sql(self, query: str, parameters: Sequence[Any] | None = None, **limits: Any) -> pl.DataFrame:
-        """Answer one SELECT over the history tables and views; limits as in `warehouse.sql.run_sql`.
+        """Answer one SELECT over the history tables and views; limits as in `fieldcal.warehouse.sql.run_sql`.
 
         Raises
         ------
         WarehouseError
             `sql_refused`, `sql_wrong`, `sql_timeout`, `sql_too_large`.
         """
-        from warehouse.sql import run_sql  # DuckDB, which only questions in SQL need
+        from fieldcal.warehouse.sql import run_sql  # DuckDB, which only questions in SQL need
 
         return run_sql(self.root, query, parameters, **limits)
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import polars as pl
 
-from warehouse import checksums
-from warehouse.layout import decode_id, prepare, signal_path, vehicle_of
-from warehouse.store import TableWriter, read_facts, read_table
+from fieldcal.warehouse import checksums
+from fieldcal.warehouse.layout import decode_id, prepare, signal_path, vehicle_of
+from fieldcal.warehouse.store import TableWriter, read_facts, read_table
 
 
 def signal_writer(

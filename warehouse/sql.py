@@ -17,11 +17,11 @@ import duckdb
 import polars as pl
 import pyarrow as pa
 
-import schemas
-from schemas import HISTORY_TABLES
-from warehouse.errors import WarehouseError
-from warehouse.layout import history_files, vehicle_of
-from warehouse.store import frame
+from fieldcal import schemas
+from fieldcal.schemas import HISTORY_TABLES
+from fieldcal.warehouse.errors import WarehouseError
+from fieldcal.warehouse.layout import history_files, vehicle_of
+from fieldcal.warehouse.store import frame
 
 # In the order in which they are made: later ones may need earlier ones.
 VIEWS = ("latest_calibration", "history", "drift_by_temperature", "worst_tic", "refusals", "calibration_at")

@@ -13,11 +13,11 @@ from typing import Any
 
 import polars as pl
 
-from warehouse.errors import WarehouseError, disk
-from warehouse.files import write_bytes
-from warehouse.layout import prepare, stage_folder
-from warehouse.sealed import BrokenSeal, seal, unseal
-from warehouse.store import frame, read_arrow, write_table
+from fieldcal.warehouse.errors import WarehouseError, disk
+from fieldcal.warehouse.files import write_bytes
+from fieldcal.warehouse.layout import prepare, stage_folder
+from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
+from fieldcal.warehouse.store import frame, read_arrow, write_table
 
 RECORD = "run.json"
 

@@ -18,10 +18,10 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-import schemas
-from schemas import SchemaMismatch
-from warehouse.errors import WarehouseError, disk
-from warehouse.files import AroundRename, AtomicFile
+from fieldcal import schemas
+from fieldcal.schemas import SchemaMismatch
+from fieldcal.warehouse.errors import WarehouseError, disk
+from fieldcal.warehouse.files import AroundRename, AtomicFile
 
 Data: TypeAlias = pl.DataFrame | pa.Table | pa.RecordBatch | Mapping[str, np.ndarray]
 
@@ -44,7 +44,7 @@ class TableWriter:
     around_rename : callable, optional
         Given the sha256: a context within which the file gets its final name.
     durable : bool
-        False: not forced to disk (`warehouse.files.AtomicFile`).
+        False: not forced to disk (`fieldcal.warehouse.files.AtomicFile`).
 
     Attributes
     ----------

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from fieldcal.errors import FieldcalError
-from warehouse import checksums
-from warehouse.content import content_sha256
-from warehouse.errors import WarehouseError, disk
-from warehouse.files import TEMPORARY, file_sha256
-from warehouse.layout import history_files
-from warehouse.sealed import BrokenSeal, unseal
-from warehouse.stage_store import RECORD, broken_outputs
-from warehouse.store import read_table
+from fieldcal.warehouse import checksums
+from fieldcal.warehouse.content import content_sha256
+from fieldcal.warehouse.errors import WarehouseError, disk
+from fieldcal.warehouse.files import TEMPORARY, file_sha256
+from fieldcal.warehouse.layout import history_files
+from fieldcal.warehouse.sealed import BrokenSeal, unseal
+from fieldcal.warehouse.stage_store import RECORD, broken_outputs
+from fieldcal.warehouse.store import read_table
 
 Problem = tuple[str, str | None]
 """A path as shown, and what is wrong with it (None: nothing)."""

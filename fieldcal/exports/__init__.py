@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from fieldcal.constants import Constants, Export
 from fieldcal.exports.ardupilot import ardupilot
 from fieldcal.exports.c_header import c_header
+from fieldcal.exports.calibration import Constants, Export
 from fieldcal.exports.json_document import json_document
 from fieldcal.exports.px4 import px4
 from fieldcal.exports.yaml_text import kalibr, ros

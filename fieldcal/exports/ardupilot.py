@@ -15,8 +15,8 @@ The first instance of each sensor is written; ArduPilot keeps parameters as floa
 
 from __future__ import annotations
 
-from fieldcal.constants import Constants, Export, cubic_about
 from fieldcal.exports.autopilot import in_autopilot_units, not_held, symmetric, thermal
+from fieldcal.exports.calibration import Constants, Export, cubic_about
 
 MILLIGAUSS = 1e-3
 COEFFICIENT = 1e6

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fieldcal.constants import Constants, Triad
+from fieldcal.exports.calibration import Constants, Triad
 
 UNIT = {
     "gyroscope": {"rad/s": 1.0, "deg/s": float(np.pi / 180.0)},

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from fieldcal.constants import SENSORS, Constants, Export
+from fieldcal.exports.calibration import SENSORS, Constants, Export
 
 APPLY = """\
 /* out = S (raw - Z) at temperature_degc; d = T - T0: S = scale + scale_per_degc d, Z = zero + zero_per_degc d

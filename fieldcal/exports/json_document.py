@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fieldcal.constants import SENSORS, Constants, Export, Triad
+from fieldcal.exports.calibration import SENSORS, Constants, Export, Triad
 
 MODEL = (
     "calibrated = S (raw - Z), d = T - temperature_degc; S = scale + scale_per_degc d, Z = zero + zero_per_degc d"

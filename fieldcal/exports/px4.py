@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fieldcal.constants import Constants, Export
 from fieldcal.exports.autopilot import in_autopilot_units, not_held, symmetric, thermal
+from fieldcal.exports.calibration import Constants, Export
 
 REAL32, INT32 = 9, 6
 AXES = "XYZ"

@@ -14,8 +14,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from fieldcal.constants import SENSORS, Constants, Export
-from fieldcal.rotation import Array
+from fieldcal.exports.calibration import SENSORS, Constants, Export
+from fieldcal.geometry.rotation import Array
 
 
 def ros(constants: Constants) -> Export:

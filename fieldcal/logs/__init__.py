@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 
 from fieldcal.errors import UnreadableLog
-from fieldcal.logs.csv import CsvLog
+from fieldcal.logs.csv.reader import CsvLog
 from fieldcal.logs.discovery import find_logs, flight_id, log_format, log_sha256
 from fieldcal.logs.interface import (
     SENSORS,
@@ -27,7 +27,7 @@ from fieldcal.logs.interface import (
     LogSummary,
     VehicleLike,
 )
-from fieldcal.logs.mcap import McapLog
+from fieldcal.logs.mcap.reader import McapLog
 
 READERS: dict[str, Callable[[Path, VehicleLike], LogReader]] = {"mcap": McapLog, "csv": CsvLog}
 """Log format (as `discovery.log_format` names it) -> reader."""

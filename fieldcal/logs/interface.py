@@ -44,7 +44,7 @@ EPOCH_KNOWN_AFTER_NS = 1_000_000_000 * 1_000_000_000
 
 
 class VehicleLike(Protocol):
-    """The part of a configured vehicle that reading a log needs (`fieldcal.configuration.Vehicle`)."""
+    """The part of a configured vehicle that reading a log needs (`fieldcal.config.configuration.Vehicle`)."""
 
     @property
     def units(self) -> Mapping[str, str]: ...

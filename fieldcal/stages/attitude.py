@@ -7,13 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 import polars as pl
 
-from fieldcal import attitude as wahba
-from fieldcal import sensor
-from fieldcal.frames import QUATERNION, columns_of, constants, matrix, triad
-from fieldcal.results import StageResult, fault_rows
-from fieldcal.rotation import Array, from_matrix, multiply
-from fieldcal.sensor_sanity import Fault
+from fieldcal.estimation import wahba
+from fieldcal.estimation.faults import Fault
+from fieldcal.geometry import sensor_model
+from fieldcal.geometry.rotation import Array, from_matrix, multiply
 from fieldcal.stages.inputs import Settings, Tables, spread_of
+from fieldcal.stages.results import StageResult, fault_rows
+from fieldcal.stages.tables import QUATERNION, columns_of, constants, matrix, triad
 
 VECTOR_SENSORS = ("magnetometer", "accelerometer")
 
@@ -62,10 +62,10 @@ def known_vectors(tables: Tables, s: Settings) -> dict[str, tuple[Array, Array]]
 
 def body_vectors(samples: pl.DataFrame, used: Mapping[str, tuple[Array, Array]], s: Settings, *, prefix: str) -> Array:
     """Calibrated magnetic field and gravity-signed acceleration in body axes, (n, 2, 3)."""
-    axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
-    field = sensor.calibrate(matrix(samples, triad("magnetometer", prefix)), *used["magnetometer"]) @ axes.T
-    gravity = sensor.calibrate(matrix(samples, triad("accelerometer", prefix)), *used["accelerometer"]) @ axes.T
-    return np.stack([field, sensor.GRAVITY_SIGNS[s["gravity_sign"]] * gravity], axis=1)
+    axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    field = sensor_model.calibrate(matrix(samples, triad("magnetometer", prefix)), *used["magnetometer"]) @ axes.T
+    gravity = sensor_model.calibrate(matrix(samples, triad("accelerometer", prefix)), *used["accelerometer"]) @ axes.T
+    return np.stack([field, sensor_model.GRAVITY_SIGNS[s["gravity_sign"]] * gravity], axis=1)
 
 
 def estimate_attitude(tables: Tables, s: Settings) -> StageResult:
@@ -157,5 +157,5 @@ def _dip_deg(vectors: Array) -> Array:
 
 def sensor_attitude(q: Array, s: Settings) -> Array:
     """Attitude of the sensor's own axes (n, 4) from that of the body: gyroscope constants live in sensor axes."""
-    axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
     return multiply(q, from_matrix(axes.T))

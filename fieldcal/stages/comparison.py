@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal import attitude as wahba
-from fieldcal import sensor, smoothing
-from fieldcal.frames import QUATERNION, constants, matrix, seconds, triad
-from fieldcal.gyro_equation import predicted_quaternion_rate
-from fieldcal.gyro_output import propagate_stretches, shooting_segments, start_stretches
-from fieldcal.manoeuvre import contiguous
-from fieldcal.metrics import Fit, theil, theil_attitude
-from fieldcal.results import StageResult
-from fieldcal.rotation import Array, continuous, slerp
+from fieldcal.estimation import smoothing, wahba
+from fieldcal.estimation.gyroscope.equation_error import predicted_quaternion_rate
+from fieldcal.estimation.gyroscope.output_error import propagate_stretches, shooting_segments, start_stretches
+from fieldcal.estimation.motion_selection import contiguous
+from fieldcal.estimation.theil import Fit, theil, theil_attitude
+from fieldcal.geometry import sensor_model
+from fieldcal.geometry.rotation import Array, continuous, slerp
 from fieldcal.stages.attitude import body_vectors, known_vectors, sensor_attitude
 from fieldcal.stages.inputs import Settings, Tables, differentiate_by_segment, spread_of
+from fieldcal.stages.results import StageResult
+from fieldcal.stages.tables import QUATERNION, constants, matrix, seconds, triad
 from fieldcal.stages.vps import BRIDGE_S, RATE_COLUMNS, bridged, interpolate_attitude
 
 HELD_OUT_STRETCH_S = 10.0
@@ -54,12 +54,10 @@ def verify_fit(tables: Tables, s: Settings) -> StageResult:
     }
     vps = tables.get("vps_aligned")
     vps_t = None if vps is None else seconds(vps["t_ns"], int(samples["t_ns"][0]))
-    axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
     rows: list[dict[str, Any]] = []
 
-    def add(
-        quantity: str, method: str, reference: str, signal: str, fit: Fit, unit: str, sample: str = "all"
-    ) -> None:
+    def add(quantity: str, method: str, reference: str, signal: str, fit: Fit, unit: str, sample: str = "all") -> None:
         rows.append(_fit_row(quantity, method, reference, signal, sample, fit, unit))
 
     name = s["attitude"]
@@ -75,7 +73,7 @@ def verify_fit(tables: Tables, s: Settings) -> StageResult:
         for method, own_constants in gyros.items():
             if own_constants is None:
                 continue
-            rate = sensor.calibrate(rate_logged, *own_constants)
+            rate = sensor_model.calibrate(rate_logged, *own_constants)
             if method == "equation_error":
                 q_dot = differentiate_by_segment(samples, q_sensor, s["differentiation_window_s"])
                 add(
@@ -102,7 +100,7 @@ def verify_fit(tables: Tables, s: Settings) -> StageResult:
         if near.any():
             add("attitude", "joint", "vps", "smoothed", theil_attitude(matrix(vps, QUATERNION)[near], own[near]), "deg")
         for signal, prefix in (("raw", ""), ("smoothed", "smoothed_")):
-            rate = sensor.calibrate(matrix(samples, triad("gyroscope", prefix)), *joint)
+            rate = sensor_model.calibrate(matrix(samples, triad("gyroscope", prefix)), *joint)
             relative = propagate_stretches(t, rate, segment)
             _propagated_against_vps(add, "joint", signal, t, relative, segment, vps, vps_t, s)
             _rates_against_vps(add, "joint", signal, t, rate @ axes.T, vps, vps_t, s)
@@ -152,7 +150,7 @@ def _held_out(
         return
     late = tables["samples"]["t_ns"].to_numpy() >= tables["held_out"]["from_ns"][0]
     t, segment = t[late], segment[late]
-    rate = sensor.calibrate(matrix(tables["samples"], triad("gyroscope"))[late], *constants_then)
+    rate = sensor_model.calibrate(matrix(tables["samples"], triad("gyroscope"))[late], *constants_then)
     if vps is not None and vps_t is not None:
         name, reference_t, q = "vps", vps_t, matrix(vps, QUATERNION)
         rates = matrix(vps, RATE_COLUMNS)
@@ -172,7 +170,7 @@ def _held_out(
     fit = theil_attitude(continuous(to_sensor), model)
     add("attitude_propagated", "joint", name, "raw", fit, "deg", "held_out")
     if rates is not None:
-        axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+        axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
         body = np.column_stack([np.interp(reference_t[near], t, c) for c in (rate @ axes.T).T])
         add("body_rate", "joint", name, "raw", theil(rates[near], body), "rad/s", "held_out")
 

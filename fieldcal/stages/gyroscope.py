@@ -8,24 +8,14 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal import gyro_equation, gyro_output, sensor
 from fieldcal.errors import EstimationError, UnusableFlight
-from fieldcal.frames import (
-    AXES,
-    QUATERNION,
-    calibration_rows,
-    constants,
-    covariance_of,
-    covariance_table,
-    matrix,
-    seconds,
-    triad,
-)
-from fieldcal.gyro_equation import GyroFit
-from fieldcal.propagation import attitude_jacobian, constants_to_equation, constants_to_gyro
-from fieldcal.regressor_noise import smoothed_noise_variance
-from fieldcal.results import StageResult, triad_rows
-from fieldcal.rotation import Array
+from fieldcal.estimation.gyroscope import equation_error, output_error
+from fieldcal.estimation.gyroscope.equation_error import GyroFit
+from fieldcal.estimation.gyroscope.regressor_noise import smoothed_noise_variance
+from fieldcal.estimation.statistics import white_noise_sigma
+from fieldcal.estimation.uncertainty_propagation import attitude_jacobian, constants_to_equation, constants_to_gyro
+from fieldcal.geometry import sensor_model
+from fieldcal.geometry.rotation import Array
 from fieldcal.stages.attitude import VECTOR_SENSORS, body_vectors, known_vectors, logged_constants, sensor_attitude
 from fieldcal.stages.inputs import (
     Settings,
@@ -36,7 +26,18 @@ from fieldcal.stages.inputs import (
     refusal,
     spread_of,
 )
-from fieldcal.statistics import white_noise_sigma
+from fieldcal.stages.results import StageResult, triad_rows
+from fieldcal.stages.tables import (
+    AXES,
+    QUATERNION,
+    calibration_rows,
+    constants,
+    covariance_of,
+    covariance_table,
+    matrix,
+    seconds,
+    triad,
+)
 
 MAX_MEDIAN_ATTITUDE_ERROR_RAD = 0.35
 
@@ -66,7 +67,7 @@ def calibrate_gyro_equation(tables: Tables, s: Settings) -> StageResult:
         side_s=s["smoothing_side_s"],
     )
     try:
-        fit = gyro_equation.fit_equation_error(
+        fit = equation_error.fit_equation_error(
             q,
             differentiate_by_segment(samples, q, s["differentiation_window_s"]),
             logged,
@@ -192,11 +193,11 @@ def _output_error(tables: Tables, s: Settings) -> StageResult:
     }
     try:
         if stretch_s > 1.5 * RUN_IN_STRETCH_S and s["initial_attitude"] == "estimated":
-            start = gyro_output.fit_output_error(t, q, logged, start, stretch_s=RUN_IN_STRETCH_S, **options)
-        fit = gyro_output.fit_output_error(t, q, logged, start, stretch_s=stretch_s, **options)
+            start = output_error.fit_output_error(t, q, logged, start, stretch_s=RUN_IN_STRETCH_S, **options)
+        fit = output_error.fit_output_error(t, q, logged, start, stretch_s=stretch_s, **options)
     except EstimationError as error:
         return refusal(error, "gyroscope")
-    median = gyro_output.attitude_error_median(t, q, fit.scale * logged + fit.bias, segment, stretch_s, weight)
+    median = output_error.attitude_error_median(t, q, fit.scale * logged + fit.bias, segment, stretch_s, weight)
     measured = {
         "stretch_s": stretch_s,
         "attitude_error_rms_deg": float(np.degrees(fit.residual_rms)),
@@ -235,7 +236,7 @@ def _start(
         return start
     nominal = replace(start, scale=np.diagonal(own[0]).copy(), bias=own[1])
     error = [
-        gyro_output.attitude_error_median(t, q, c.scale * logged + c.bias, segment, RUN_IN_STRETCH_S, weight)
+        output_error.attitude_error_median(t, q, c.scale * logged + c.bias, segment, RUN_IN_STRETCH_S, weight)
         for c in (start, nominal)
     ]
     return start if error[0] <= error[1] else nominal
@@ -246,7 +247,7 @@ def _suitable_stretch(start: GyroFit, t: Array, logged: Array, tables: Tables) -
     noise = white_noise_sigma(logged)
     excess = tables["attitude"]["acceleration_excess_mps2"].to_numpy(), tables["attitude"]["field_excess"].to_numpy()
     error = max(spread_of(excess[0] / 9.81), spread_of(excess[1]))
-    return gyro_output.suitable_stretch_s(
+    return output_error.suitable_stretch_s(
         float(np.max(noise * np.abs(start.scale))), float(np.median(np.diff(t))), error
     )
 
@@ -257,13 +258,13 @@ def _triad_uncertainty(tables: Tables, s: Settings) -> list[tuple[Array, Array]]
     if not any(f"{name}_covariance" in tables for name in VECTOR_SENSORS):
         return []
     samples, attitude = tables["samples"], tables["attitude"]
-    axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
     vectors = body_vectors(samples, known_vectors(tables, s), s, prefix="smoothed_")
     spread = (
         spread_of(attitude["field_excess"].to_numpy()),
         spread_of(attitude["acceleration_excess_mps2"].to_numpy() / s["gravity_mps2"]),
     )
-    sign = {"magnetometer": 1.0, "accelerometer": sensor.GRAVITY_SIGNS[s["gravity_sign"]]}
+    sign = {"magnetometer": 1.0, "accelerometer": sensor_model.GRAVITY_SIGNS[s["gravity_sign"]]}
     pairs = []
     for i, name in enumerate(VECTOR_SENSORS):
         covariance = tables.get(f"{name}_covariance")

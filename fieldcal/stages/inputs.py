@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal import smoothing
-from fieldcal.results import StageResult, fatal_fault
-from fieldcal.rotation import Array
-from fieldcal.sensor import default_reference_reading
+from fieldcal.estimation import smoothing
+from fieldcal.geometry.rotation import Array
+from fieldcal.geometry.sensor_model import default_reference_reading
+from fieldcal.stages.results import StageResult, fatal_fault
 
 Tables = Mapping[str, pl.DataFrame]
 

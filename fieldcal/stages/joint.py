@@ -8,9 +8,19 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal import joint_start, joint_terms, sensor
 from fieldcal.errors import EstimationError, UnusableFlight
-from fieldcal.frames import (
+from fieldcal.estimation.joint import initialise, model_selection
+from fieldcal.estimation.joint.covariance import advice
+from fieldcal.estimation.joint.fit import JointFit, fit_joint
+from fieldcal.estimation.joint.measurement_model import body_jumps
+from fieldcal.estimation.joint.problem import TERMS, Readings
+from fieldcal.geometry import sensor_model
+from fieldcal.geometry.rotation import Array, from_matrix, multiply
+from fieldcal.stages.attitude import logged_constants
+from fieldcal.stages.inputs import Settings, Tables, is_sound, mean_temperature, reference_reading, refusal
+from fieldcal.stages.joint_reference import Poses, poses_of, with_poses
+from fieldcal.stages.results import StageResult, fatal_fault, triad_rows, zero_slope_rows
+from fieldcal.stages.tables import (
     AXES,
     QUATERNION,
     calibration_rows,
@@ -21,15 +31,6 @@ from fieldcal.frames import (
     seconds,
     triad,
 )
-from fieldcal.joint import JointFit, fit_joint
-from fieldcal.joint_covariance import advice
-from fieldcal.joint_model import body_jumps
-from fieldcal.joint_record import TERMS, Readings
-from fieldcal.results import StageResult, fatal_fault, triad_rows, zero_slope_rows
-from fieldcal.rotation import Array, from_matrix, multiply
-from fieldcal.stages.attitude import logged_constants
-from fieldcal.stages.inputs import Settings, Tables, is_sound, mean_temperature, reference_reading, refusal
-from fieldcal.stages.joint_reference import Poses, poses_of, with_poses
 
 METHOD = "joint"
 SENSORS = ("magnetometer", "accelerometer", "gyroscope")
@@ -57,21 +58,21 @@ def estimate_jointly(tables: Tables, s: Settings) -> StageResult:
     if tables["samples"]["gyroscope_x"].null_count():
         return StageResult(status="refused", reason_code="no_gyroscope", reason="The joint estimate needs a gyroscope.")
     readings = readings_of(tables, s)
-    axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
     arm = None if s["lever_arm_m"] is None else axes.T @ np.asarray(s["lever_arm_m"], dtype=float)
     try:
-        model, start = joint_start.prepare(readings, start_constants(tables, s, readings), lever_arm=arm)
+        model, start = initialise.prepare(readings, start_constants(tables, s, readings), lever_arm=arm)
         fit = fit_joint(model, start, try_lever_arm=arm is None)
     except (UnusableFlight, EstimationError) as error:
         return refusal(error, "joint estimate")
     poses = poses_of(tables, s)
     fit, by_vps = with_poses(fit, poses, s)
-    fit, tests = joint_terms.add_terms(fit)
+    fit, tests = model_selection.add_terms(fit)
     result = _written(fit, tables, s, axes)
     return replace(
         result,
         tables={**result.tables, **_held_out(fit, readings, tables, s, arm, poses)},
-        measured={**result.measured, **by_vps, "terms": joint_terms.told(tests, fit)},
+        measured={**result.measured, **by_vps, "terms": model_selection.told(tests, fit)},
     )
 
 
@@ -92,10 +93,10 @@ def _held_out(
     part = readings.part(slice(0, split))
     known = {name: fit.constants(name)[:2] for name in SENSORS if name in fit.layout}
     try:
-        own = fit_joint(*joint_start.prepare(part, known, lever_arm=arm), try_lever_arm=arm is None)
+        own = fit_joint(*initialise.prepare(part, known, lever_arm=arm), try_lever_arm=arm is None)
         own, _ = with_poses(own, poses, s)
         kept = [name for name in TERMS if name in fit.layout]
-        own = joint_terms.with_terms(own, kept) if kept else own
+        own = model_selection.with_terms(own, kept) if kept else own
     except (UnusableFlight, EstimationError):
         return {}
     matrix, bias, covariance, _ = _triad(own, "gyroscope")
@@ -135,9 +136,9 @@ def readings_of(tables: Tables, s: Settings) -> Readings:
         t=t,
         segment=segment,
         gyroscope=logged["gyroscope"],
-        gravity_mps2=sensor.GRAVITY_SIGNS[s["gravity_sign"]] * s["gravity_mps2"],
+        gravity_mps2=sensor_model.GRAVITY_SIGNS[s["gravity_sign"]] * s["gravity_mps2"],
         field_ned=np.asarray(s["field_ned"], dtype=float),
-        turning=joint_start.turning(t, segment, logged["gyroscope"]),
+        turning=initialise.turning(t, segment, logged["gyroscope"]),
         **given,
     )
 
@@ -166,7 +167,7 @@ def start_constants(tables: Tables, s: Settings, readings: Readings) -> dict[str
         logged = getattr(readings, name)
         if out[name] is None and name in magnitudes and logged is not None:
             polarity = np.asarray(s["polarity"][name], dtype=float)
-            out[name] = joint_start.start_of_triad(logged, magnitudes[name], polarity)
+            out[name] = initialise.start_of_triad(logged, magnitudes[name], polarity)
     return out
 
 

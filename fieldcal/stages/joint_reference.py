@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from fieldcal import sensor, sync
 from fieldcal.errors import EstimationError, UnusableFlight
-from fieldcal.frames import QUATERNION, matrix, seconds
-from fieldcal.joint import JointFit, fit_joint
-from fieldcal.joint_vps import VpsRecord
-from fieldcal.rotation import Array, continuous, to_rotation_vector
+from fieldcal.estimation.clock_sync import by_rates
+from fieldcal.estimation.joint.fit import JointFit, fit_joint
+from fieldcal.estimation.joint.pose_measurement import VpsRecord
+from fieldcal.geometry import sensor_model
+from fieldcal.geometry.rotation import Array, continuous, to_rotation_vector
 from fieldcal.stages.attitude import sensor_attitude
 from fieldcal.stages.inputs import Settings, Tables
+from fieldcal.stages.tables import QUATERNION, matrix, seconds
 from fieldcal.stages.vps import vps_attitude
 
 
@@ -39,7 +40,7 @@ def poses_of(tables: Tables, s: Settings) -> Poses | None:
     if abs(base_ns) * 1e-9 <= s["vps_max_lag_s"] + length_s:
         base_ns = 0
     t, q = seconds(stamps, origin + base_ns), vps_attitude(matrix(tables["vps"], QUATERNION), s)
-    keep = sync.mask_outliers(t, q)
+    keep = by_rates.mask_outliers(t, q)
     return Poses(t[keep], continuous(sensor_attitude(q[keep], s)), base_ns * 1e-9, s["vps_max_gap_s"])
 
 
@@ -50,9 +51,9 @@ def with_poses(fit: JointFit, poses: Poses | None, s: Settings) -> tuple[JointFi
     readings = fit.model.readings
     scale, bias, _ = fit.constants("gyroscope")
     try:
-        clock = sync.synchronise(
+        clock = by_rates.synchronise(
             readings.t,
-            sensor.calibrate(readings.gyroscope, scale, bias),
+            sensor_model.calibrate(readings.gyroscope, scale, bias),
             poses.t,
             poses.q,
             max_lag_s=s["vps_max_lag_s"],
@@ -63,9 +64,7 @@ def with_poses(fit: JointFit, poses: Poses | None, s: Settings) -> tuple[JointFi
         if vps is None:
             return fit, {"use_vps": False, "use_vps_reason": "vps_too_short"}
         start = replace(fit.state, values={**fit.state.values, **vps.start()})
-        own = fit_joint(
-            fit.model, start, try_lever_arm="lever_arm" in fit.layout, vps=vps, levels=fit.levels
-        )
+        own = fit_joint(fit.model, start, try_lever_arm="lever_arm" in fit.layout, vps=vps, levels=fit.levels)
     except (UnusableFlight, EstimationError) as error:
         return fit, {"use_vps": False, "use_vps_reason": error.reason_code}
     return replace(own, iterations=fit.iterations + own.iterations), _told(own, vps, poses)

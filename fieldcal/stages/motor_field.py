@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal import ellipsoid, motor_field, sensor
 from fieldcal.errors import EstimationError, UnusableFlight
-from fieldcal.frames import constants, matrix, triad
-from fieldcal.results import fatal_fault
-from fieldcal.rotation import Array
-from fieldcal.sensor_sanity import Fault
+from fieldcal.estimation import ellipsoid, motor_field
+from fieldcal.estimation.faults import Fault
+from fieldcal.geometry import sensor_model
+from fieldcal.geometry.rotation import Array
 from fieldcal.stages.inputs import Settings, Tables, in_used_segments
+from fieldcal.stages.results import fatal_fault
+from fieldcal.stages.tables import constants, matrix, triad
 
 PAUSE_S = 1.0
 PAUSE = 5.0
@@ -51,7 +52,7 @@ def check_motor_field(tables: Tables, s: Settings) -> tuple[dict[str, Any], list
         drive = _drive_at(readings["t_ns"].to_numpy(), power["t_ns"].to_numpy(), power[column].to_numpy())
         rows = np.flatnonzero(whole & np.isfinite(drive))
         rows = rows[:: 1 + len(rows) // MOST_SAMPLES]
-        field = sensor.calibrate(values[rows], *known)
+        field = sensor_model.calibrate(values[rows], *known)
         found = motor_field.motor_field(field, drive[rows], float(np.linalg.norm(s["field_ned"])))
         if found is None:
             continue

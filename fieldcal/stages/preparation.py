@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal import manoeuvre, smoothing
-from fieldcal.frames import columns_of, matrix, seconds, triad
-from fieldcal.results import StageResult
-from fieldcal.rotation import Array
+from fieldcal.estimation import motion_selection, smoothing
+from fieldcal.geometry.rotation import Array
 from fieldcal.stages.inputs import Settings, Tables
+from fieldcal.stages.results import StageResult
+from fieldcal.stages.tables import columns_of, matrix, seconds, triad
 
 SHORTEST_STRETCH = 10
 MAGNETOMETER_PAUSE_S = 0.1
@@ -25,7 +25,7 @@ def find_manoeuvre(tables: Tables, s: Settings) -> StageResult:
     t = seconds(imu["t_ns"], imu["t_ns"][0])
     rate = matrix(imu, triad("gyroscope"))
     rate_or_none = None if np.isnan(rate).any() else rate
-    found = manoeuvre.select(
+    found = motion_selection.select(
         t,
         rate_or_none,
         window_s=s["manoeuvre_window_s"],

@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal import ellipsoid, manoeuvre, sensor
-from fieldcal.ellipsoid import TriadFit
 from fieldcal.errors import EstimationError, UnusableFlight
-from fieldcal.frames import calibration_rows, constants, covariance_table, matrix, seconds, triad
-from fieldcal.results import StageResult, fatal_fault, fault_rows, triad_rows
-from fieldcal.rotation import Array
+from fieldcal.estimation import ellipsoid, motion_selection
+from fieldcal.estimation.ellipsoid import TriadFit
+from fieldcal.geometry import sensor_model
+from fieldcal.geometry.rotation import Array
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import (
     Settings,
@@ -24,6 +23,8 @@ from fieldcal.stages.inputs import (
     refusal,
 )
 from fieldcal.stages.motor_field import check_motor_field
+from fieldcal.stages.results import StageResult, fatal_fault, fault_rows, triad_rows
+from fieldcal.stages.tables import calibration_rows, constants, covariance_table, matrix, seconds, triad
 
 ELLIPSOID_METHOD = {
     "robust": "ellipsoid_robust",
@@ -153,20 +154,20 @@ def calibrate_accelerometer_gated(tables: Tables, s: Settings) -> StageResult:
     measured: dict[str, Any] = {"lever_arm_applied": s["lever_arm_m"] is not None and gyro is not None}
     if gyro is None:
         # Rates in counts: at rest, the one thing that can be told without a scale.
-        level, noise = manoeuvre.windowed_rate(
+        level, noise = motion_selection.windowed_rate(
             seconds(samples["t_ns"], samples["t_ns"][0]), matrix(samples, triad("gyroscope")), REST_WINDOW_S
         )
         slow = level < 4.0 * noise
     else:
-        axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
-        rate = sensor.calibrate(matrix(samples, triad("gyroscope", "smoothed_")), *gyro) @ axes.T
+        axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+        rate = sensor_model.calibrate(matrix(samples, triad("gyroscope", "smoothed_")), *gyro) @ axes.T
         slow = np.linalg.norm(rate, axis=1) < s["gate_rate_radps"]
         if s["lever_arm_m"] is not None:
             arm = _lever_arm(samples, rate, s)
             logged, smoothed = (
-                sensor.to_centre_of_mass(x, known[0], arm, axes, s["gravity_sign"]) for x in (logged, smoothed)
+                sensor_model.to_centre_of_mass(x, known[0], arm, axes, s["gravity_sign"]) for x in (logged, smoothed)
             )
-    norm = np.linalg.norm(sensor.calibrate(smoothed, *known), axis=1) / s["gravity_mps2"]
+    norm = np.linalg.norm(sensor_model.calibrate(smoothed, *known), axis=1) / s["gravity_mps2"]
     quiet = (np.abs(norm - 1.0) < s["gate_norm"]) & slow
     other = float(np.sqrt(np.mean((norm - 1.0) ** 2)))
     measured |= {"gate_passed": int(quiet.sum()), "gate_share": float(quiet.mean()), "other_acceleration_rms_g": other}
@@ -207,7 +208,7 @@ def _gated_fit(source: Array, quiet: np.ndarray, s: Settings) -> TriadFit | None
 def _lever_arm(samples: pl.DataFrame, rate: Array, s: Settings) -> Array:
     """Acceleration of the sensor about the centre of mass, m/s², body axes, from smoothed rates (Eq. 3)."""
     rate_dot = differentiate_by_segment(samples, rate, s["differentiation_window_s"])
-    return sensor.lever_arm_acceleration(rate, rate_dot, s["lever_arm_m"])
+    return sensor_model.lever_arm_acceleration(rate, rate_dot, s["lever_arm_m"])
 
 
 def _with_motor_field(rows: pl.DataFrame, share: float, strength: float) -> pl.DataFrame:

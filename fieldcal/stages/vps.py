@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fieldcal import sensor, smoothing, sync
 from fieldcal.errors import UnusableFlight
-from fieldcal.frames import AXES, QUATERNION, columns_of, constants, matrix, seconds, triad
-from fieldcal.results import StageResult
-from fieldcal.rotation import (
+from fieldcal.estimation import smoothing
+from fieldcal.estimation.clock_sync import by_rates
+from fieldcal.estimation.clock_sync.by_field import refine_by_field
+from fieldcal.geometry import sensor_model
+from fieldcal.geometry.rotation import (
     Array,
     body_from_inertial,
     conjugate,
@@ -24,7 +25,8 @@ from fieldcal.rotation import (
 )
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Settings, Tables, is_sound
-from fieldcal.sync_field import refine_by_field
+from fieldcal.stages.results import StageResult
+from fieldcal.stages.tables import AXES, QUATERNION, columns_of, constants, matrix, seconds, triad
 
 NED_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # rotation of ENU components to NED
 
@@ -50,8 +52,8 @@ def synchronise_vps(tables: Tables, s: Settings) -> StageResult:
     if np.isnan(logged).any():
         return StageResult(status="refused", reason_code="no_gyroscope", reason="Synchronisation needs a gyroscope.")
     gyro = _gyro_constants(tables, s)
-    axes = sensor.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
-    rate = (logged - np.median(logged, axis=0) if gyro is None else sensor.calibrate(logged, *gyro)) @ axes.T
+    axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    rate = (logged - np.median(logged, axis=0) if gyro is None else sensor_model.calibrate(logged, *gyro)) @ axes.T
     origin = int(imu["t_ns"][0])
     t_imu = seconds(imu["t_ns"], origin)
     # Clocks of different epochs: their starts are laid together first, as integers.
@@ -60,7 +62,7 @@ def synchronise_vps(tables: Tables, s: Settings) -> StageResult:
         base_ns = 0
     t_vps = seconds(vps["t_ns"], origin + base_ns)
     q_vps = vps_attitude(matrix(vps, QUATERNION), s)
-    keep = sync.mask_outliers(t_vps, q_vps)
+    keep = by_rates.mask_outliers(t_vps, q_vps)
     measured: dict[str, Any] = {
         "vps_samples": len(keep),
         "vps_masked": int((~keep).sum()),
@@ -68,7 +70,7 @@ def synchronise_vps(tables: Tables, s: Settings) -> StageResult:
     }
     t_vps, q_vps = t_vps[keep], q_vps[keep]
     try:
-        fit = sync.synchronise(
+        fit = by_rates.synchronise(
             t_imu,
             rate,
             t_vps,
@@ -107,8 +109,8 @@ def synchronise_vps(tables: Tables, s: Settings) -> StageResult:
 
 
 def _refined(
-    fit: sync.SyncFit, tables: Tables, s: Settings, origin: int, t_vps: Array, q_vps: Array
-) -> tuple[sync.SyncFit, dict[str, Any]]:
+    fit: by_rates.SyncFit, tables: Tables, s: Settings, origin: int, t_vps: Array, q_vps: Array
+) -> tuple[by_rates.SyncFit, dict[str, Any]]:
     """The clock by a sound magnetometer too, and what that found."""
     table = tables.get("magnetometer_log")
     if table is None or table.is_empty() or not is_sound(tables, "magnetometer"):
@@ -160,18 +162,18 @@ def _aligned(
 ) -> tuple[dict[str, Array], dict[str, Any]]:
     """VPS attitude and rate on a uniform grid at its own rate, IMU clock, both constant rotations put in."""
     interval = float(np.median(np.diff(t_vps)))
-    rates = sync.vps_rates(t_vps, q_vps, interval, max_gap_s=s["vps_max_gap_s"])
+    rates = by_rates.vps_rates(t_vps, q_vps, interval, max_gap_s=s["vps_max_gap_s"])
     t = rates.t
     inside = rates.valid & (t >= t_imu[0]) & (t <= t_imu[-1])
     t, q, vps_rate = t[inside], slerp(t_vps, continuous(q_vps), t[inside]), rates.rate[inside]
     own_rate = smoothing.low_pass(
-        np.column_stack([np.interp(t, t_imu, c) for c in rate.T]), sync.FINE_CUTOFF_HZ, interval
+        np.column_stack([np.interp(t, t_imu, c) for c in rate.T]), by_rates.FINE_CUTOFF_HZ, interval
     )
     body = np.array([0.0, 0.0, 0.0, 1.0])
     if calibrated:
-        smooth = smoothing.low_pass(vps_rate, sync.FINE_CUTOFF_HZ, interval)
+        smooth = smoothing.low_pass(vps_rate, by_rates.FINE_CUTOFF_HZ, interval)
         # ω_body = R ω_vps: components turn by A(body) = R, the attitude by the same quaternion on the right.
-        body = from_matrix(sync.rotation_between(smooth, own_rate))
+        body = from_matrix(by_rates.rotation_between(smooth, own_rate))
     q = multiply(q, body)
     vps_rate = sensor_rotation(vps_rate, body)
     world = np.array([0.0, 0.0, 0.0, 1.0])

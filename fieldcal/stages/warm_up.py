@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from fieldcal import warm_up
 from fieldcal.errors import UnusableFlight
-from fieldcal.frames import calibration_rows, constants, matrix, seconds, triad
-from fieldcal.results import ZERO_SLOPE, StageResult, zero_slope_rows
-from fieldcal.rotation import Array
+from fieldcal.estimation import warm_up
+from fieldcal.geometry.rotation import Array
 from fieldcal.stages.inputs import Settings, Tables, is_sound
+from fieldcal.stages.results import ZERO_SLOPE, StageResult, zero_slope_rows
+from fieldcal.stages.tables import calibration_rows, constants, matrix, seconds, triad
 
 METHOD, PARAMETER = "warm_up", ZERO_SLOPE
 CURVE = "zero_over_temperature"

@@ -1,0 +1,1 @@
+"""A night's logic, importable without Prefect: what is due, what was done, what it leaves in the history."""

@@ -1,0 +1,102 @@
+"""What closes a night, once its flights are published: the fleet's trends, what is new in them, the reports."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from fieldcal.config.configuration import Alerts
+from fieldcal.schemas import TABLES
+from fieldcal.schemas.arrow import VERSION_KEY
+from fieldcal.stages.run_key import code_digest
+from fieldcal.trends.changes import Change, changes, last_usable
+from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.checksums import history_digest
+from fieldcal.warehouse.errors import disk
+from fieldcal.warehouse.files import write_bytes
+from fieldcal.warehouse.layout import history_files
+from fieldcal.warehouse.lock import fleet_lock
+from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
+from fieldcal.warehouse.store import read_facts
+
+INPUTS = ("calibration", "fit", "flight", "run", "sync")
+MOST_PAGES = 10
+
+
+@dataclass
+class Closing:
+    """What is new in the fleet, and where its report is."""
+
+    changes: list[Change] = field(default_factory=list)
+    report: Path | None = None
+
+
+def close_night(root: Path, alerts: Alerts) -> Closing:
+    """Bring trends and reports up to the history; what is to be told tonight that was not told before.
+
+    Trends are regressed only where the history, or the code that makes them, is another than last time. Reports: the
+    fleet's page, and the pages of vehicles of which something is told; `fieldcal report` makes any other.
+
+    Raises
+    ------
+    WarehouseError
+        As `fieldcal.trends.drift_table.update_drift`; `busy`.
+    """
+    now = datetime.now(UTC)
+    with fleet_lock(root):
+        before = _remembered(root)
+        _forget_other_versions(root)
+        former = Warehouse(root).scan("drift").collect()
+        made_from = _made_from(root)
+        if before.get("made_from") != made_from or before.get("made") != history_digest(root, ["drift"]):
+            from fieldcal.trends.drift_table import update_drift
+
+            update_drift(root)
+        table = Warehouse(root).scan("drift").collect()
+        # With other limits than last time, what they make old is told whenever it passed them.
+        limits = asdict(alerts)
+        since = datetime.fromisoformat(before["at"]) if before.get("alerts") == limits else None
+        told = changes(former, table, last_usable(root), now=now, since=since, alerts=alerts)
+        made = history_digest(root, ["drift"])
+        record = {"at": now.isoformat(), "made_from": made_from, "made": made, "alerts": limits}
+        write_bytes(_place(root), seal(record), durable=False)
+        return Closing(told, _reports(root, told))
+
+
+def _reports(root: Path, told: Sequence[Change]) -> Path:
+    from fieldcal.report import write_night_reports
+
+    vehicles = list(dict.fromkeys(change.vehicle_id for change in told if change.kind not in ("expired", "idle")))
+    return write_night_reports(root, vehicles[:MOST_PAGES])[0]
+
+
+def _forget_other_versions(root: Path) -> None:
+    """Remove trends that another release wrote in another form: they follow from the history and are made anew."""
+    for path in history_files(root, "drift"):
+        try:
+            version = read_facts(path).get(VERSION_KEY)
+        except (OSError, ValueError):
+            continue  # damaged, which publishing tells
+        if version != str(TABLES["drift"].version):
+            with disk(path, "removed"):
+                path.unlink()
+
+
+def _made_from(root: Path) -> str:
+    """Digest of what trends are made from: the history and the code."""
+    return hashlib.sha256(f"{history_digest(root, INPUTS)}\0{code_digest()}".encode()).hexdigest()
+
+
+def _remembered(root: Path) -> Mapping[str, Any]:
+    try:
+        return unseal(_place(root).read_bytes())
+    except (OSError, BrokenSeal):
+        return {}
+
+
+def _place(root: Path) -> Path:
+    return root / "night" / "closing.json"

@@ -1,0 +1,55 @@
+"""What a night has to look at: the logs, what they are, which are copies, and whose settings apply."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from fieldcal.config.configuration import Configuration
+from fieldcal.flight.job import Job, file_stamp
+from fieldcal.logs import LogFile, find_logs, flight_id, log_sha256
+
+Ledger = Mapping[str, tuple[tuple[int, ...], str]]
+"""Path of a log → the stamp of its files when they were hashed, sha256."""
+
+
+def find_jobs(
+    archive: Path, configuration: Configuration, session: Path | None = None, ledger: Ledger | None = None
+) -> list[Job]:
+    """All logs of an archive, or of one session folder of it, in the order of their place.
+
+    Each is hashed, unless the `ledger` knows it as it is.
+    """
+    logs: Iterable[LogFile] = find_logs(archive, configuration.logs)
+    if session is not None:
+        inside = session.resolve()
+        logs = (log for log in logs if log.path.resolve().is_relative_to(inside))
+    return [_job(log, ledger or {}) for log in logs]
+
+
+def _job(log: LogFile, ledger: Ledger) -> Job:
+    known = (str(log.path), log.log_uri, log.vehicle_id, log.session_id, log.log_format)
+    try:
+        stamp = file_stamp(log.path)
+        remembered = ledger.get(str(log.path))
+        sha256 = remembered[1] if remembered and remembered[0] == stamp else log_sha256(log.path)
+    except OSError as error:
+        stand_in = flight_id(hashlib.sha256(f"unreadable\0{log.log_uri}".encode()).hexdigest())
+        why = f"{log.log_uri} cannot be read ({error.strerror}). Check its permissions."
+        return Job(*known, None, stand_in, problem=why)
+    return Job(*known, sha256, flight_id(sha256), stamp)
+
+
+def without_copies(jobs: list[Job], known: dict[str, str], present: set[str]) -> tuple[list[Job], dict[str, str]]:
+    """Jobs to look at, and for each copy (by log_uri) the log_uri of the log it is a copy of.
+
+    The first is the one the history knows (`known`: flight_id → log_uri), while it is still `present` in the archive;
+    else the one whose place sorts first.
+    """
+    first: dict[str, str] = {}
+    for job in jobs:
+        recorded = known.get(job.flight_id)
+        first.setdefault(job.flight_id, recorded if recorded in present else job.log_uri)
+    kept = [job for job in jobs if first[job.flight_id] == job.log_uri]
+    return kept, {job.log_uri: first[job.flight_id] for job in jobs if first[job.flight_id] != job.log_uri}

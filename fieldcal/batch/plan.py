@@ -1,0 +1,52 @@
+"""What is missing: every log of the archive against what the cache and the history hold. Changes nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fieldcal.batch.jobs import find_jobs, without_copies
+from fieldcal.batch.log_ledger import read_ledger
+from fieldcal.batch.steps import FlightWork, Record
+from fieldcal.config.configuration import Configuration
+from fieldcal.flight.job import Job
+from fieldcal.warehouse import Warehouse
+
+
+@dataclass
+class Plan:
+    """A night before it runs.
+
+    `unchanged`: flights all of whose results are there, with their records; `missing`: flights with steps to run, each
+    with why; `copies`: log_uri → log_uri of the log it is a copy of.
+    """
+
+    jobs: list[Job] = field(default_factory=list)
+    unchanged: dict[str, dict[str, Record]] = field(default_factory=dict)
+    missing: dict[str, dict[str, str]] = field(default_factory=dict)
+    copies: dict[str, str] = field(default_factory=dict)
+    copied: list[Job] = field(default_factory=list)
+
+
+def make_plan(root: Path, archive: Path, configuration: Configuration, session: Path | None = None) -> Plan:
+    """Find the logs and decide for each which steps must run."""
+    found = find_jobs(archive, configuration, session, read_ledger(root))
+    kept, copies = without_copies(found, *_known(root, archive))
+    plan = Plan(copies=copies, copied=[job for job in found if job.log_uri in copies])
+    for job in kept:
+        work = FlightWork(root, job, configuration.vehicle(job.vehicle_id))
+        pending = work.pending()
+        plan.jobs.append(job)
+        if pending:
+            plan.missing[job.flight_id] = pending
+        else:
+            plan.unchanged[job.flight_id] = work.records
+    return plan
+
+
+def _known(root: Path, archive: Path) -> tuple[dict[str, str], set[str]]:
+    """Logs the history knows: flight_id → log_uri, and those of them that are in the archive."""
+    rows = Warehouse(root).scan("flight").select("flight_id", "log_uri").sort("log_uri").collect()
+    known: dict[str, Any] = dict(rows.iter_rows())
+    return known, {uri for uri in known.values() if (archive / uri).exists()}

@@ -1,0 +1,106 @@
+"""Bring the history up to what the night found: one vehicle at a time, only flights whose rows differ."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from fieldcal.batch.steps import Record
+from fieldcal.config.configuration import Configuration
+from fieldcal.flight.job import Job
+from fieldcal.flight.rows import StageTables, flight_row, judged, lead, published_tables, rows_frame, run_rows
+from fieldcal.stages.pipeline import INGEST, PUBLISHED
+from fieldcal.warehouse.publish import publish, read_history
+from fieldcal.warehouse.stage_store import StageStore
+
+
+def publish_vehicle(
+    root: Path, vehicle_id: str, flights: Sequence[tuple[Job, Mapping[str, Record]]], configuration: Configuration
+) -> tuple[str, ...]:
+    """Publish the flights of one vehicle whose rows are not there yet or differ; the tables that changed.
+
+    A flight that has another content now than when it was published under the same place replaces its former self; one
+    that moved to this vehicle leaves the one it was published under.
+    """
+    imu_id = configuration.vehicle(vehicle_id).imu_id
+    former = read_history(root, "flight", vehicle_id)
+    fresh = _rows(flights, imu_id)
+    stale = _differing(root, vehicle_id, former, fresh, {job.flight_id: records for job, records in flights})
+    places, ids = {job.log_uri for job, _ in flights}, [job.flight_id for job, _ in flights]
+    gone = former.filter(pl.col("log_uri").is_in(list(places)) & ~pl.col("flight_id").is_in(ids))
+    leaving = set(gone["flight_id"].to_list())
+    if not stale and not leaving:
+        return ()
+    own = {table: frame.filter(pl.col("flight_id").is_in(list(stale))) for table, frame in fresh.items()}
+    made = [
+        (lead(job, imu_id, records[INGEST]["facts"]), _tables(root, job, records))
+        for job, records in flights
+        if job.flight_id in stale
+    ]
+    return publish(root, vehicle_id, {**own, **published_tables(made)} if stale else {}, stale | leaving)
+
+
+def withdraw(root: Path, vehicle_id: str, flights: set[str]) -> None:
+    """Take flights that moved elsewhere out of a vehicle's history."""
+    publish(root, vehicle_id, {}, flights)
+
+
+def _rows(flights: Sequence[tuple[Job, Mapping[str, Record]]], imu_id: str) -> dict[str, pl.DataFrame]:
+    """`flight` and `run` as they should be."""
+    rows: dict[str, list[dict[str, Any]]] = {"flight": [], "run": []}
+    for job, records in flights:
+        facts = judged(records[INGEST]["facts"], records)
+        leading = lead(job, imu_id, facts)
+        rows["flight"].append(flight_row(job, leading, facts))
+        rows["run"] += run_rows(leading, records)
+    return {table: rows_frame(table, own) for table, own in rows.items()}
+
+
+def _differing(
+    root: Path,
+    vehicle_id: str,
+    former: pl.DataFrame,
+    fresh: Mapping[str, pl.DataFrame],
+    records: Mapping[str, Mapping[str, Record]],
+) -> set[str]:
+    """Flights whose rows in `flight` and `run`, or whose numbers of rows elsewhere, are not what they should be."""
+    there = {"flight": former, "run": read_history(root, "run", vehicle_id)}
+    stale = set()
+    for table, held in there.items():
+        both = _counted(fresh[table], held, list(held.columns))
+        stale |= set(both.filter(pl.col("new") != pl.col("held"))["flight_id"].to_list())
+    for table, sources in PUBLISHED.items():
+        wanted = {flight_id: _row_count(own, sources) for flight_id, own in records.items()}
+        held = read_history(root, table, vehicle_id)
+        counts = dict(held.group_by("flight_id").len().iter_rows())
+        stale |= {flight_id for flight_id, count in wanted.items() if counts.get(flight_id, 0) != count}
+    return stale & set(records)
+
+
+def _counted(new: pl.DataFrame, held: pl.DataFrame, columns: list[str]) -> pl.DataFrame:
+    """Every distinct row of either, with how often each has it."""
+    marked = pl.concat([new.with_columns(new=1, held=0), held.select(columns).with_columns(new=0, held=1)])
+    return marked.group_by(columns).agg(pl.col("new").sum(), pl.col("held").sum())
+
+
+def _row_count(records: Mapping[str, Record], sources: Sequence[str]) -> int:
+    return sum(
+        records[step]["outputs"].get(table, {}).get("rows", 0)
+        for step, table in (source.split(".") for source in sources)
+        if step in records
+    )
+
+
+def _tables(root: Path, job: Job, records: Mapping[str, Record]) -> StageTables:
+    """What the stages made of one flight for the history."""
+    store = StageStore(root)
+    tables = {}
+    for source in (name for sources in PUBLISHED.values() for name in sources):
+        step, table = source.split(".")
+        if step in records and table in records[step]["outputs"]:
+            run_key = records[step]["run_key"]
+            tables[source] = (store.load(step, job.flight_id, run_key, [table])[table], run_key)
+    return tables

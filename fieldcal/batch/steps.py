@@ -1,0 +1,271 @@
+"""One flight's steps through the cache: which key, is its result there and whole, else run it. Nothing of Prefect here.
+
+A step is "ingest" or a stage of `fieldcal.stages.pipeline.PIPELINE`. Its record (`run.json`) is all that later steps
+and the history need to know: status, reason, measured numbers, versions, and the sha256 of every output.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from fieldcal.batch.reasons import NO_RESULT, why_it_runs
+from fieldcal.config.configuration import Vehicle
+from fieldcal.errors import UnreadableLog, unforeseen
+from fieldcal.flight.job import Job, file_stamp
+from fieldcal.flight.versions import versions
+from fieldcal.logs import ingest
+from fieldcal.logs.tidy import Disordered
+from fieldcal.stages.pipeline import INGEST, PIPELINE, Stage, run_stage
+from fieldcal.stages.results import StageResult, plain
+from fieldcal.stages.run_key import run_key, source_digest
+from fieldcal.warehouse.errors import WarehouseError
+from fieldcal.warehouse.files import file_sha256
+from fieldcal.warehouse.layout import signal_path
+from fieldcal.warehouse.signals import read_signal, signal_writer
+from fieldcal.warehouse.stage_store import StageStore
+from fieldcal.warehouse.store import TableWriter
+
+STEPS = (INGEST, *(stage.name for stage in PIPELINE))
+STAGES: dict[str, Stage] = {stage.name: stage for stage in PIPELINE}
+Record = dict[str, Any]
+
+
+_sources: dict[str, str] = {}
+
+
+def step_sources() -> Mapping[str, str]:
+    """Digest of the source of every step, taken once in a process: what runs is what was imported."""
+    if not _sources:
+        functions: dict[str, Callable[..., Any]] = {name: stage.function for name, stage in STAGES.items()}
+        functions[INGEST] = ingest.tidy_log
+        _sources.update({step: source_digest(function) for step, function in functions.items()})
+    return _sources
+
+
+def take_sources(sources: Mapping[str, str]) -> None:
+    """Take digests that were worked out from the same code (`code_digest`)."""
+    _sources.update(sources)
+
+
+class FlightWork:
+    """The steps of one flight, in order. Tables stay in memory while they are needed, and are read from disk otherwise.
+
+    Parameters
+    ----------
+    root : Path
+        Data root of the warehouse.
+    job : Job
+        The log.
+    vehicle : Vehicle
+        Its vehicle's configuration.
+    """
+
+    def __init__(self, root: Path, job: Job, vehicle: Vehicle) -> None:
+        self.job = job
+        self.records: dict[str, Record] = {}
+        self.why: dict[str, str] = {}
+        """Why each step had to run, of those that `find` did not."""
+        self.work_s = 0.0
+        """Time that the steps' own work took: reading their input, computing, writing their output."""
+        self._root = root
+        self._store = StageStore(root)
+        self._vehicle = vehicle
+        self._settings: dict[str, Any] = {}
+        self._inputs: dict[str, str] = {}
+        self._tables: dict[str, pl.DataFrame] = {}
+
+    def usable(self) -> bool:
+        """Whether ingest left anything to calibrate on; known once its record is."""
+        return self.records[INGEST]["facts"]["verdict"] in ("ok", "partial")
+
+    def steps(self) -> tuple[str, ...]:
+        """The steps there are: ingest alone for a log that is rejected or quarantined."""
+        return STEPS if INGEST not in self.records or self.usable() else STEPS[:1]
+
+    def key(self, step: str) -> str:
+        """run_key of a step; the records of the steps before it must be known."""
+        return run_key(step, step_sources()[step], self._params(step), self._hashes(step))
+
+    def find(self, step: str) -> Record | None:
+        """The record of a step whose result is there and whole, taken as the step's; else None, and `why` says why."""
+        record = self._store.complete(step, self.job.flight_id, self.key(step))
+        if record is None or (step == INGEST and not self._signals_whole(record)):
+            former = self._store.latest(step, self.job.flight_id)
+            self.why[step] = NO_RESULT if former is None else why_it_runs(former, self._causes(step))
+            return None
+        self._take(step, record)
+        return record
+
+    def run(self, step: str) -> Record:
+        """Run a step, whatever the cache says, and keep its result; its record.
+
+        An error of the step itself becomes the status `failed` and is not kept: the next night tries again.
+
+        Raises
+        ------
+        WarehouseError
+            The warehouse cannot be written: this concerns every log.
+        """
+        began = time.perf_counter()
+        record = self._ingest() if step == INGEST else self._stage(STAGES[step])
+        self.work_s += time.perf_counter() - began
+        self._take(step, record)
+        return record
+
+    def pending(self) -> dict[str, str]:
+        """Steps whose result is missing, and those that read from them, each with why; nothing is run or changed."""
+        missing: dict[str, str] = {}
+        for step in STEPS:
+            if INGEST in self.records and not self.usable():
+                break
+            sources = {name.split(".")[0] for name in STAGES[step].reads.values()} if step != INGEST else set()
+            if above := sorted(sources & set(missing)):
+                missing[step] = f"new input: {', '.join(above)}"
+            elif self.find(step) is None:
+                missing[step] = self.why[step]
+        return missing
+
+    def _take(self, step: str, record: Record) -> None:
+        self.records[step] = record
+        outputs = record["signals"] if step == INGEST else record["outputs"]
+        self._inputs |= {f"{step}.{table}": output["sha256"] for table, output in outputs.items()}
+        if step == INGEST:
+            self._settings = ingest.settings_of(record["facts"], self._vehicle) if self.usable() else {}
+
+    def _params(self, step: str) -> dict[str, Any]:
+        if step != INGEST:
+            return {name: self._settings[name] for name in STAGES[step].settings}
+        settings = self._vehicle.settings()
+        named = {"vehicle_id": self.job.vehicle_id, "name": Path(self.job.path).name}
+        return {**{name: settings[name] for name in ("csv", "mcap", "units")}, **named}
+
+    def _hashes(self, step: str) -> dict[str, str]:
+        if step == INGEST:
+            return {"log": self.job.sha256 or ""}
+        sources = sorted(set(STAGES[step].reads.values()))
+        return {name: self._inputs[name] for name in sources if name in self._inputs}
+
+    def _causes(self, step: str) -> Record:
+        """What the key of a step is made of, as its record keeps it."""
+        return {
+            "run_key": self.key(step),
+            "params": plain(self._params(step)),
+            "inputs": self._hashes(step),
+            "source": step_sources()[step],
+            "versions": versions(),
+        }
+
+    # --- ingest
+
+    def _ingest(self) -> Record:
+        key = self.key(INGEST)
+        if self.job.problem is not None:
+            return self._ingest_record(ingest.rejected("not_readable", self.job.problem), {}, key, keep=False)
+        try:
+            facts, signals = self._write_signals(whole=False)
+        except Disordered:
+            facts, signals = self._write_signals(whole=True)
+        except WarehouseError:
+            raise
+        except Exception as error:
+            return self._ingest_record(
+                ingest.rejected("ingest_failed", unforeseen(self.job.log_uri, error)), {}, key, keep=False
+            )
+        if facts["verdict"] != "rejected" and file_stamp(Path(self.job.path)) != tuple(self.job.stamp):
+            why = f"{self.job.log_uri} changed while it was read; the next night takes it when it is complete."
+            return self._ingest_record(ingest.rejected("changed_while_read", why), {}, key, keep=False)
+        return self._ingest_record(facts, signals, key, keep=facts["reason_code"] != ingest.TOO_SLOW)
+
+    def _write_signals(self, *, whole: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Stream the log into the signal tables; nothing appears unless the whole log came through."""
+        writers: dict[str, TableWriter] = {}
+        try:
+            with ExitStack() as stack:
+                path, units = Path(self.job.path), None
+                log = ingest.tidy_log(path, self._vehicle, whole=whole)
+                for table, frame in log.tables():
+                    if table not in writers:
+                        units = units or log.units() or ingest.logged_units(path, self._vehicle)
+                        writers[table] = stack.enter_context(self._writer(table, units))
+                    writers[table].write(frame)
+                facts = log.facts()
+                if facts["verdict"] == "quarantined":
+                    raise _Quarantined(facts)
+        except _Quarantined as stop:
+            return stop.facts, {}
+        except UnreadableLog as error:
+            return ingest.rejected(error.reason_code, error.sentence), {}
+        return facts, {name: {"sha256": w.sha256, "rows": w.n_rows} for name, w in sorted(writers.items())}
+
+    def _writer(self, table: str, units: Mapping[str, str]) -> TableWriter:
+        return signal_writer(self._root, table, self.job.vehicle_id, self.job.flight_id, units=units)
+
+    def _ingest_record(self, facts: Mapping[str, Any], signals: Mapping[str, Any], key: str, *, keep: bool) -> Record:
+        status = "ok" if facts["verdict"] in ("ok", "partial") else "refused"
+        record = {
+            "status": "failed" if facts["reason_code"] == "ingest_failed" else status,
+            "reason_code": facts["reason_code"],
+            "reason": facts["reason"],
+            "measured": plain({"rows": facts["rows"], "units": facts["units"], "verdict": facts["verdict"]}),
+            **self._causes(INGEST),
+            "facts": plain(facts),
+            "signals": dict(signals),
+        }
+        return self._kept(INGEST, key, {}, record) if keep else _unkept(record, key)
+
+    def _signals_whole(self, record: Record) -> bool:
+        paths = {t: signal_path(self._root, t, self.job.vehicle_id, self.job.flight_id) for t in record["signals"]}
+        return all(p.exists() and file_sha256(p) == record["signals"][t]["sha256"] for t, p in paths.items())
+
+    # --- stages
+
+    def _stage(self, stage: Stage) -> Record:
+        key = self.key(stage.name)
+        try:
+            tables = {name: self._table(name) for name in set(stage.reads.values()) if name in self._inputs}
+            result = run_stage(stage, tables, self._settings)
+        except WarehouseError:
+            raise
+        except Exception as error:
+            why = f"{stage.name}: {unforeseen(self.job.log_uri, error)}"
+            result = StageResult(status="failed", reason_code="stage_failed", reason=why)
+        record = {
+            "status": result.status,
+            "reason_code": result.reason_code,
+            "reason": result.reason,
+            "measured": plain(result.measured),
+            **self._causes(stage.name),
+        }
+        if result.status == "failed":
+            return _unkept(record, key)
+        self._tables |= {f"{stage.name}.{name}": frame for name, frame in result.tables.items()}
+        return self._kept(stage.name, key, result.tables, record)
+
+    def _table(self, name: str) -> pl.DataFrame:
+        if name not in self._tables:
+            step, table = name.split(".")
+            if step == INGEST:
+                self._tables[name] = read_signal(self._root, table, self.job.vehicle_id, self.job.flight_id)
+            else:
+                loaded = self._store.load(step, self.job.flight_id, self.records[step]["run_key"], [table])
+                self._tables[name] = loaded[table]
+        return self._tables[name]
+
+    def _kept(self, step: str, key: str, tables: Mapping[str, pl.DataFrame], record: Record) -> Record:
+        return self._store.save(step, self.job.flight_id, key, tables, record)
+
+
+class _Quarantined(Exception):
+    def __init__(self, facts: dict[str, Any]) -> None:
+        super().__init__(facts["reason"])
+        self.facts = facts
+
+
+def _unkept(record: Record, key: str) -> Record:
+    return {**record, "run_key": key, "outputs": {}, "unkept": True}

@@ -1,0 +1,75 @@
+"""`fieldcal demo`: a small simulated fleet, its night, and one flight beside the truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from fieldcal.cli.present_night import print_night
+from fieldcal.cli.progress import NightProgress
+from fieldcal.cli.show import console, table
+from fieldcal.flows.run import run_night
+from fieldcal.simulation.archive import write_flights
+from fieldcal.simulation.experiment import SENSORS, Experiment
+from fieldcal.warehouse import Warehouse
+from fieldcal.words.numbers import number, with_sd
+from fieldcal.words.talk import say
+
+VEHICLES, SESSIONS, FLIGHTS = 2, 2, 1
+BEST_METHODS = {"magnetometer": "ellipsoid_robust", "accelerometer": "ellipsoid_robust", "gyroscope": "output_error"}
+QUESTIONS = (
+    "SELECT vehicle_id, sensor, axis, value_at_25degc, sd FROM latest_calibration WHERE parameter = 'scale'",
+    "SELECT log_uri, quantity, method, reference, tic, rms, rms_unit FROM worst_tic LIMIT 10",
+    "SELECT vehicle_id, lag_mid_s, lag_sd_s, skew_ppm FROM sync",
+)
+
+
+def run_demo(folder: Path, root: Path, config: Path | None) -> bool:
+    """Simulate, run the night, print. Whether any log is not `ok`."""
+    archive = folder / "archive"
+    say(f"Simulating {VEHICLES} vehicles, {SESSIONS} sessions each, in {archive} …")
+    logs = write_flights(archive, Experiment(), vehicles=VEHICLES, sessions=SESSIONS, flights=FLIGHTS)
+    say("Running the night (its first minute goes to Prefect's server) …")
+    with NightProgress() as progress:
+        result = run_night(archive.absolute(), root, config, None, 1, progress)
+    out = console()
+    print_night(out, result, root)
+    uri = logs[0].relative_to(archive).as_posix()
+    truth = json.loads(logs[0].with_name(logs[0].stem + ".truth.json").read_text(encoding="utf-8"))
+    flight = next(log["flight_id"] for log in result["logs"] if log["log_uri"] == uri)
+    out.print(_beside_truth(root, flight, truth, uri))
+    out.print("Ask next:", markup=False)
+    for question in QUESTIONS:
+        out.print(f'  fieldcal sql --warehouse {root} "{question}"', markup=False, soft_wrap=True)
+    return bool(result["ok"] != len(result["logs"]))
+
+
+def _beside_truth(root: Path, flight_id: str, truth: Mapping[str, Any], uri: str) -> Any:
+    """Scale and zero of one flight, with sd, the truth, and the error in sd and per cent."""
+    rows = Warehouse(root).scan("calibration", flight_id=flight_id).filter(pl.col("parameter").is_in(["scale", "zero"]))
+    found = {
+        (row["sensor"], row["method"], row["parameter"], row["axis"]): row
+        for row in rows.collect().iter_rows(named=True)
+    }
+    lines = []
+    for sensor in SENSORS:
+        for i, axis in enumerate("xyz"):
+            for parameter in ("scale", "zero"):
+                row = found.get((sensor, BEST_METHODS[sensor], parameter, axis))
+                true = truth["constants"][sensor][parameter][i]
+                if row is not None and row["value"] is not None:
+                    lines.append(
+                        [sensor, parameter, axis, with_sd(row["value"], row["sd"]), number(true, 6), *_error(row, true)]
+                    )
+    columns = ["sensor", "parameter", "axis", "found", "truth", "error %", "error in sd"]
+    return table(columns, lines, f"{uri} beside the truth of the simulation")
+
+
+def _error(row: Mapping[str, Any], true: float) -> tuple[str, str]:
+    error = row["value"] - true
+    in_sd = f"{error / row['sd']:+.1f}" if row["sd"] else "–"
+    return f"{100 * error / abs(true):+.2f}", in_sd

@@ -1,0 +1,174 @@
+"""`fieldcal doctor`: is everything there that a night needs, and what to do where it is not. Nothing is changed."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import shutil
+import stat
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from packaging.requirements import Requirement
+
+import fieldcal
+from fieldcal.flows.alive import FOLDER as RUNNING
+from fieldcal.flows.alive import dead, is_held
+from fieldcal.flows.server import answers, no_answer, serving_address
+
+OK, WARNING, FAILED = "ok", "warning", "failed"
+LEAST_FREE_BYTES = 200 << 20
+LITTLE_FREE_BYTES = 2 << 30
+LEAST_FILES_OPEN = 256
+LEAST_PYTHON = (3, 11)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing looked at: what was found, and what to do unless it is ok."""
+
+    check: str
+    status: str
+    found: str
+    advice: str | None = None
+
+
+def examine(root: Path, archive: Path | None = None) -> dict[str, Any]:
+    """Look at everything.
+
+    Returns
+    -------
+    dict
+        `ok` (nothing failed) and `checks`, a list of `{"check", "status", "found", "advice"}`; status is ok, warning or
+        failed.
+    """
+    checks = [
+        *_versions(),
+        *_root(root),
+        *([] if archive is None else [_archive(archive)]),
+        *_disk(root),
+        _open_files(),
+        *_locks(root),
+        _server(root),
+    ]
+    return {"ok": all(check.status != FAILED for check in checks), "checks": [asdict(check) for check in checks]}
+
+
+def _versions() -> Iterator[Check]:
+    machine = f"{platform.system()} {platform.machine()}"
+    found = f"{platform.python_implementation()} {platform.python_version()} on {machine}"
+    old = sys.version_info[:2] < LEAST_PYTHON
+    yield Check("python", FAILED if old else OK, found, "Install Python 3.11 or later." if old else None)
+    yield Check("fieldcal", OK, fieldcal.__version__)
+    try:
+        required = importlib.metadata.requires("fieldcal") or []
+    except importlib.metadata.PackageNotFoundError:
+        yield Check("libraries", WARNING, "fieldcal is not installed", "Install it: pip install fieldcal.")
+        return
+    for text in required:
+        wanted = Requirement(text)
+        if wanted.marker is None or wanted.marker.evaluate({"extra": ""}):
+            yield _library(wanted)
+
+
+def _library(wanted: Requirement) -> Check:
+    advice = f"pip install '{wanted.name}{wanted.specifier}'"
+    try:
+        version = importlib.metadata.version(wanted.name)
+    except importlib.metadata.PackageNotFoundError:
+        return Check(wanted.name, FAILED, "missing", advice)
+    if wanted.specifier.contains(version, prereleases=True):
+        return Check(wanted.name, OK, version)
+    return Check(wanted.name, WARNING, f"{version}, tested with {wanted.specifier}", advice)
+
+
+def _root(root: Path) -> Iterator[Check]:
+    place = _nearest(root)
+    if not root.exists():
+        yield Check("warehouse", OK, f"{root} does not exist yet; the first night makes it")
+    elif not root.is_dir():
+        yield Check("warehouse", FAILED, f"{root} is no folder", "Move the file, or name another --warehouse.")
+        return
+    else:
+        yield Check("warehouse", OK, str(root))
+    yield _writable(place)
+    stages = root / "stages"
+    if stages.is_dir() and stat.S_IMODE(stages.stat().st_mode) & 0o077:
+        yield Check("cache", WARNING, f"{stages} is open to others", f"chmod 700 '{stages}' (the next night does).")
+
+
+def _writable(folder: Path) -> Check:
+    """By writing, since root squash, quotas and read-only mounts do not show in the mode."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as stream:
+            stream.write(bytes(4096))
+            stream.flush()
+            os.fsync(stream.fileno())
+    except OSError as error:
+        why = f"{folder} cannot be written: {(error.strerror or str(error)).lower()}"
+        return Check("permissions", FAILED, why, "Give this user the right to it, or name another --warehouse.")
+    return Check("permissions", OK, f"{folder} can be written")
+
+
+def _archive(archive: Path) -> Check:
+    if not archive.is_dir():
+        return Check("archive", FAILED, f"there is no folder {archive}", "Mount it, or correct the path.")
+    unreadable = [path for path in sorted(archive.rglob("*")) if not path.is_symlink() and not os.access(path, os.R_OK)]
+    if unreadable:
+        found = f"{len(unreadable)} of its files cannot be read, the first is {unreadable[0]}"
+        return Check("archive", WARNING, found, "Give this user the right to read them.")
+    return Check("archive", OK, str(archive))
+
+
+def _disk(root: Path) -> Iterator[Check]:
+    place = _nearest(root)
+    free = shutil.disk_usage(place).free
+    status = FAILED if free < LEAST_FREE_BYTES else WARNING if free < LITTLE_FREE_BYTES else OK
+    advice = None if status == OK else f"Free some space below {place}; a night needs about the size of its new logs."
+    yield Check("disk", status, f"{free / 1e9:.1f} GB free at {place}", advice)
+    nodes = os.statvfs(place)
+    if nodes.f_files and nodes.f_favail < 10_000:
+        yield Check("disk", WARNING, f"{nodes.f_favail} inodes free at {place}", "Remove files that are not needed.")
+
+
+def _open_files() -> Check:
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    few = limit != resource.RLIM_INFINITY and limit < LEAST_FILES_OPEN
+    return Check("open files", WARNING if few else OK, f"limit {limit}", "Raise it: ulimit -n 1024." if few else None)
+
+
+def _locks(root: Path) -> Iterator[Check]:
+    held = [path for path in sorted(root.glob(".lock-*")) if is_held(path)]
+    names = ", ".join(path.name.removeprefix(".lock-") for path in held[:5])
+    yield Check("locks", OK, f"being published now: {names}" if held else "free")
+    if (root / RUNNING).is_dir() and (abandoned := dead(root)):
+        yield Check("runs", WARNING, f"{len(abandoned)} were killed", "The next night marks them as crashed.")
+
+
+def _server(root: Path) -> Check:
+    own = os.environ.get("PREFECT_API_URL")
+    if own:
+        if answers(own):
+            return Check("server", OK, f"PREFECT_API_URL={own} answers")
+        return Check("server", FAILED, f"PREFECT_API_URL={own} does not answer", no_answer(own))
+    serving = serving_address(root)
+    if serving is None:
+        return Check("server", OK, "none is configured; every night starts one of its own on 127.0.0.1")
+    if answers(serving):
+        return Check("server", OK, f"fieldcal serve answers at {serving}")
+    return Check("server", WARNING, f"fieldcal serve is not running ({serving})", "Start it again: fieldcal serve.")
+
+
+def _nearest(path: Path) -> Path:
+    """The path, or the folder above it that exists."""
+    path = path.absolute()
+    while not path.exists() and path != path.parent:
+        path = path.parent
+    return path

@@ -1,0 +1,379 @@
+"""The command line: `fieldcal`. What each command does lies in the modules that it imports when it runs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import App, CycloptsError, Parameter
+
+import fieldcal
+from fieldcal.cli.drift import drift
+from fieldcal.cli.fly import apply, export
+from fieldcal.cli.interrupt import interruptible
+from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
+from fieldcal.cli.report import report as report_command
+from fieldcal.cli.serve import serve, trigger
+from fieldcal.cli.simulate import simulate
+
+OK, FAILED, USAGE, LOSSES, BUSY, INTERRUPTED = 0, 1, 2, 3, 75, 130
+USAGE_CODES = ("not_found", "no_archive", "no_session", "sql_refused", "sql_wrong", "wrong_option")
+
+app = App(
+    name="fieldcal",
+    help="Field calibration of inertial sensors from flight logs.",
+    version=fieldcal.__version__,
+    result_action="return_value",
+    help_format="plaintext",
+    suppress_keyboard_interrupt=False,
+    default_parameter=Parameter(negative=""),
+)
+
+
+@app.command
+def demo(folder: Path = Path("fieldcal-demo"), /, *, warehouse: Root = None, config: Config = None) -> int:
+    """Simulate a small fleet flying the paper's manoeuvre, run the night, show the result.
+
+    Parameters
+    ----------
+    folder
+        Where logs and results go.
+    """
+    from fieldcal.cli.demo import run_demo
+
+    return LOSSES if run_demo(folder, warehouse or folder / "fieldcal-data", config) else OK
+
+
+@app.command
+def calibrate(
+    log: Path,
+    /,
+    *,
+    vehicle: str | None = None,
+    method: Literal["serial", "joint"] | None = None,
+    profile: Literal["full", "onboard", "paper"] | None = None,
+    set_: Annotated[list[str] | None, Parameter(name="--set")] = None,
+    report: Annotated[Path | None, Parameter(help="Write the flight's report to this HTML file too.")] = None,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Calibrate one log: parameters with their standard deviations, agreement, verdict. Nothing is stored.
+
+    Parameters
+    ----------
+    log
+        An MCAP or CSV file, or a folder with imu.csv.
+    vehicle
+        The vehicle in fieldcal.toml; else the folder two levels above the log.
+    method
+        "serial", one step after the other, or "joint", all in one likelihood; else what fieldcal.toml says.
+    profile
+        Presets of the stages.
+    set_
+        Overrule a stage parameter: --set smoothing_cutoff_hz=6.
+    """
+    from fieldcal.cli.show import console, print_json
+    from fieldcal.flight.calibrate import run_log
+    from fieldcal.words.talk import say
+
+    changes = _assignments(set_ or [])
+    result = run_log(log, config, vehicle_id=vehicle, profile=profile, method=method, changes=changes)
+    document = result.document
+    if report is not None:
+        from fieldcal.report import log_report
+
+        say(f"Report: {log_report(result, report)}")
+    if as_json:
+        print_json(document)
+    else:
+        from fieldcal.cli.present_flight import print_flight
+
+        print_flight(console(), document)
+    return OK if document["flight"]["verdict"] == "ok" else LOSSES
+
+
+@app.command
+def nightly(
+    archive: Path,
+    /,
+    *,
+    workers: Workers = 1,
+    runner: Runner = "process",
+    scheduler: Scheduler = None,
+    dry_run: DryRun = False,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Calibrate every new or changed log of an archive and publish the results.
+
+    Parameters
+    ----------
+    archive
+        Folder of logs: ARCHIVE/<vehicle>/<session>/<log>.
+    """
+    _need_folder(archive, "no_archive", "archive")
+    where = {"runner": runner, "scheduler": scheduler}
+    return _night(archive.absolute(), None, workers, where, dry_run, as_json, warehouse, config)
+
+
+@app.command
+def session(
+    folder: SessionFolder,
+    /,
+    *,
+    workers: Workers = 1,
+    runner: Runner = "process",
+    scheduler: Scheduler = None,
+    dry_run: DryRun = False,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """The same as the night for one field session, now.
+
+    Parameters
+    ----------
+    folder
+        Folder of the session: ARCHIVE/<vehicle>/<session>.
+    """
+    _need_folder(folder, "no_session", "session folder")
+    own = folder.absolute()
+    where = {"runner": runner, "scheduler": scheduler}
+    return _night(own.parent.parent, own, workers, where, dry_run, as_json, warehouse, config)
+
+
+@app.command
+def history(
+    *,
+    vehicle: str | None = None,
+    sensor: Literal["magnetometer", "accelerometer", "gyroscope"] | None = None,
+    parameter: str | None = None,
+    since: str | None = None,
+    as_json: AsJson = False,
+    as_csv: AsCsv = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Calibrated parameters, flight by flight.
+
+    Parameters
+    ----------
+    vehicle, sensor
+        Only these.
+    parameter
+        scale, bias, zero or zero_bias.
+    since
+        Only flights that started then or later: 2026-05-04 or 2026-05-04T12:00.
+    """
+    from fieldcal.cli.show import print_frame
+    from fieldcal.warehouse.questions import calibration_history
+
+    rows = calibration_history(_root(warehouse), vehicle, sensor, parameter, since)
+    whole = as_json or as_csv
+    print_frame(rows if whole else rows.drop("imu_id", "session_id", "flight_id"), as_json=as_json, as_csv=as_csv)
+    return OK
+
+
+@app.command
+def sql(
+    query: str, /, *, as_json: AsJson = False, as_csv: AsCsv = False, warehouse: Root = None, config: Config = None
+) -> int:
+    """Answer one SELECT over the tables and views; it can only read.
+
+    Parameters
+    ----------
+    query
+        "SELECT …"
+    """
+    from fieldcal.cli.show import print_frame
+    from fieldcal.warehouse.questions import answer
+
+    print_frame(answer(_root(warehouse), query), as_json=as_json, as_csv=as_csv)
+    return OK
+
+
+@app.command
+def verify(
+    *,
+    archive: Path | None = None,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Check every stored file against its recorded sha256.
+
+    Parameters
+    ----------
+    archive
+        Check the logs of this archive too.
+    """
+    from fieldcal.cli.show import print_json
+    from fieldcal.logs import log_sha256
+    from fieldcal.warehouse.verify import verify as check
+    from fieldcal.words.talk import say
+
+    if archive is not None:
+        _need_folder(archive, "no_archive", "archive")
+    result = check(_root(warehouse), archive, log_sha256)
+    if as_json:
+        print_json(result)
+    else:
+        for damage in result["damaged"]:
+            print(f"{damage['path']}: {damage['reason']}")
+        say(f"{result['files']} files checked, {len(result['damaged'])} damaged")
+        print(f"content_sha256 {result['content_sha256'] or 'unknown: tables are damaged'}")
+    return OK if result["ok"] else FAILED
+
+
+@app.command
+def doctor(
+    *,
+    archive: Path | None = None,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Check versions, disk, permissions, locks and server, and say what to do.
+
+    Parameters
+    ----------
+    archive
+        Check that the logs of this archive can be read too.
+    """
+    from fieldcal.cli.doctor import examine
+    from fieldcal.cli.show import print_json
+
+    result = examine(_root(warehouse), archive)
+    if as_json:
+        print_json(result)
+    else:
+        for check in result["checks"]:
+            advice = f"\n{'':23}{check['advice']}" if check["advice"] else ""
+            print(f"{check['status']:8} {check['check']:14}{check['found']}{advice}")
+    return OK if result["ok"] else FAILED
+
+
+def main(tokens: Sequence[str] | None = None) -> None:
+    """Run the command line and exit with its code."""
+    sys.exit(run(sys.argv[1:] if tokens is None else tokens))
+
+
+def run(tokens: Sequence[str]) -> int:
+    """Run one command; its exit code. Errors are one sentence on stderr, unless FIELDCAL_DEBUG=1."""
+    try:
+        with interruptible():
+            code: Any = app(list(tokens), exit_on_error=False, print_error=False)
+        sys.stdout.flush()
+        return OK if code is None else int(code)
+    except CycloptsError as error:
+        return _told(f"{' '.join(str(error).split())} (fieldcal --help)", USAGE)
+    except KeyboardInterrupt:
+        return _told("Interrupted; what is done is kept, the next run goes on from there.", INTERRUPTED)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    except Exception as error:
+        if os.environ.get("FIELDCAL_DEBUG") == "1":
+            raise
+        return _explained(error)
+
+
+def _explained(error: Exception) -> int:
+    from fieldcal.errors import ConfigurationError, FieldcalError
+
+    if isinstance(error, ConfigurationError):
+        return _told(error.sentence, USAGE)
+    if isinstance(error, FieldcalError):
+        code = BUSY if error.reason_code == "busy" else USAGE if error.reason_code in USAGE_CODES else FAILED
+        return _told(error.sentence, code)
+    if isinstance(error, OSError) and error.filename is not None:
+        return _told(f"{error.filename}: {error.strerror}.", FAILED)
+    told = " ".join(str(error).split())
+    return _told(f"{type(error).__name__}: {told} (FIELDCAL_DEBUG=1 shows where).", FAILED)
+
+
+def _told(sentence: str, code: int) -> int:
+    print(f"fieldcal: {' '.join(sentence.split())}", file=sys.stderr)
+    return code
+
+
+def _night(
+    archive: Path,
+    folder: Path | None,
+    workers: int,
+    where: dict[str, str | None],
+    dry: bool,
+    as_json: bool,
+    warehouse: Path | None,
+    config: Path | None,
+) -> int:
+    from fieldcal.cli.show import console, print_json
+    from fieldcal.flows.run import dry_run as plan_only
+    from fieldcal.flows.run import run_night
+
+    if workers < 1:
+        raise _usage("wrong_option", "--workers must be 1 or more.")
+    root = _root(warehouse)
+    if dry:
+        plan = plan_only(archive, root, config, folder)
+        if as_json:
+            print_json(plan)
+        else:
+            from fieldcal.cli.present_night import print_plan
+
+            print_plan(console(), plan)
+        return OK
+    from fieldcal.cli.progress import NightProgress
+
+    with NightProgress() as progress:
+        result = run_night(archive, root, config, folder, workers, progress, **where)
+    if as_json:
+        print_json(result)
+    else:
+        from fieldcal.cli.present_night import print_night
+
+        print_night(console(), result, root)
+    return OK if result["ok"] == len(result["logs"]) else LOSSES
+
+
+def _root(warehouse: Path | None) -> Path:
+    from fieldcal.warehouse import Warehouse
+
+    return Warehouse(warehouse).root
+
+
+def _need_folder(folder: Path, reason_code: str, what: str) -> None:
+    if not folder.is_dir():
+        raise _usage(reason_code, f"There is no {what} at {folder}.")
+
+
+def _usage(reason_code: str, sentence: str) -> Exception:
+    from fieldcal.errors import FieldcalError
+
+    return FieldcalError(reason_code, sentence)
+
+
+def _assignments(texts: list[str]) -> dict[str, str]:
+    """["name=value", …] as a dictionary."""
+    pairs = [text.partition("=") for text in texts]
+    for name, equals, _ in pairs:
+        if not equals or not name:
+            raise _usage("wrong_option", f'--set needs name=value, not "{name}".')
+    return {name.strip(): value.strip() for name, _, value in pairs}
+
+
+app.command(report_command, name="report")
+app.command(serve)
+app.command(trigger)
+app.command(simulate)
+app.command(drift)
+app.command(export)
+app.command(apply)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""A night on the terminal: the table that closes it, and what one would do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from fieldcal.batch.outcome import cause
+from fieldcal.cli.show import table
+from fieldcal.warehouse import Warehouse
+from fieldcal.words.flights import is_consequence
+from fieldcal.words.numbers import number
+
+WORST = 5
+REFUSALS = 12
+CHANGES = 20
+
+
+def print_night(console: Console, result: Mapping[str, Any], root: Path) -> None:
+    """The closing table: verdicts, what was refused and why, the worst fits, where to look next."""
+    counts = ", ".join(f"{result[verdict]} {verdict}" for verdict in ("ok", "partial", "quarantined", "rejected"))
+    work = f"{result['stages_run']} stages run, {result['stages_cached']} from the cache, {result['seconds']:.1f} s"
+    console.print(f"{len(result['logs'])} logs: {counts}; {work}", markup=False)
+    troubled = [log for log in result["logs"] if log["verdict"] != "ok" or log["reason_code"]]
+    if troubled:
+        lines = [[log["log_uri"], log["verdict"], log["reason"] or ""] for log in troubled]
+        console.print(table(["log", "verdict", "why"], lines, "Logs that need a look"))
+    refused = [line for log in result["logs"] for line in _refusals(log)]
+    if refused:
+        console.print(table(["log", "refused", "why"], refused[:REFUSALS], "Refusals"))
+        if len(refused) > REFUSALS:
+            console.print(f"  … and {len(refused) - REFUSALS} more: SELECT * FROM refusals", markup=False)
+    worst = _worst(root, [log["flight_id"] for log in result["logs"]])
+    if worst:
+        columns = ["log", "quantity", "method", "against", "TIC", "rms"]
+        console.print(table(columns, worst, "Poorest agreement (Theil inequality coefficient, smoothed)"))
+    if result["changes"]:
+        lines = [[change["kind"], change["sentence"]] for change in result["changes"]]
+        console.print(table(["new", "what"], lines[:CHANGES], "What changed in the fleet"))
+        if len(lines) > CHANGES:
+            console.print(f"  … and {len(lines) - CHANGES} more: fieldcal drift", markup=False)
+    console.print(f"History: {root}/tables (fieldcal history, drift, sql)", markup=False)
+    console.print(f"Report:  {result['report']} (fieldcal report --vehicle V, --flight ID)", markup=False)
+
+
+def _refusals(log: Mapping[str, Any]) -> list[list[str]]:
+    """Lines of what a log's stages refused, each reason once; what only follows from another refusal is left out."""
+    stages: dict[str, list[str]] = {}
+    for refusal in log["refusals"]:
+        if not is_consequence(refusal):
+            stages.setdefault(refusal["reason"] or refusal["reason_code"], []).append(refusal["stage"])
+    names = [log["log_uri"], *[""] * len(stages)]
+    return [[name, ", ".join(own), reason] for name, (reason, own) in zip(names, stages.items(), strict=False)]
+
+
+def print_plan(console: Console, plan: Mapping[str, Any]) -> None:
+    """What a night would do."""
+    console.print(
+        f"{len(plan['logs'])} logs; {plan['stages_to_run']} stages would run. Nothing was changed.", markup=False
+    )
+    lines = [[log["log_uri"], _would(log)] for log in plan["logs"] if log["would_run"] or log["copy_of"]]
+    if lines:
+        console.print(table(["log", "would run"], lines))
+
+
+def _would(log: Mapping[str, Any]) -> str:
+    if log["copy_of"]:
+        return f"nothing: a copy of {log['copy_of']}"
+    return cause(log["would_run"])
+
+
+def _worst(root: Path, flights: Sequence[str]) -> list[list[str]]:
+    import polars as pl
+
+    warehouse = Warehouse(root)
+    places = warehouse.scan("flight").select("flight_id", "log_uri")
+    rows = (
+        warehouse.scan("fit")
+        .filter(pl.col("flight_id").is_in(list(flights)) & (pl.col("signal") == "smoothed"))
+        .join(places, on="flight_id")
+        .sort("tic", "log_uri", "quantity", "method", descending=[True, False, False, False], nulls_last=True)
+        .select("log_uri", "quantity", "method", "reference", "tic", "rms", "rms_unit")
+        .head(WORST)
+        .collect()
+    )
+    return [[*row[:4], number(row[4], 3), f"{number(row[5], 3)} {row[6]}"] for row in rows.iter_rows()]

@@ -1,0 +1,114 @@
+"""`fieldcal serve` and `fieldcal trigger`: the schedule, and the ground station's call."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from fieldcal.cli.options import AsJson, Config, Root, SessionFolder
+
+EVERY_NIGHT = "0 3 * * *"
+
+
+def serve(
+    archive: Path | None = None,
+    /,
+    *,
+    cron: str = EVERY_NIGHT,
+    timezone: str | None = None,
+    watch: Path | None = None,
+    quiet: float = 60.0,
+    workers: int = 1,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Host the nightly schedule and the session trigger, until interrupted.
+
+    Parameters
+    ----------
+    archive
+        Archive of the nightly runs; else the watched one, else the folder of --config, else this folder.
+    cron
+        When the night runs: minute hour day month weekday.
+    timezone
+        Time zone of --cron, such as Europe/Berlin; else this machine's.
+    watch
+        Trigger the sessions of this archive by themselves when their files have stopped growing.
+    quiet
+        Seconds without change after which a watched session has landed.
+    workers
+        Processes that calibrate.
+    """
+    from fieldcal.config.find import find_source
+    from fieldcal.errors import FieldcalError
+    from fieldcal.flows.server import running_server
+    from fieldcal.warehouse import Warehouse
+    from fieldcal.warehouse.layout import prepare
+    from fieldcal.words.talk import say
+
+    place = archive or watch or (config.parent if config else Path())
+    for what, folder in (("archive", place), ("archive to watch", watch)):
+        if folder is not None and not folder.is_dir():
+            raise FieldcalError("no_archive", f"There is no {what} at {folder}.")
+    find_source(config, place)
+    root = Warehouse(warehouse).root.absolute()
+    prepare(root)
+    os.environ.setdefault("PREFECT_RUNNER_POLL_FREQUENCY", "2")
+    with running_server(root, serving=True) as server:
+        from fieldcal.flows.deploy import deployments, host, local_timezone
+        from fieldcal.flows.housekeeping import tidy_prefect
+
+        url = server.wait()
+        tidy_prefect(root, url, own_server=server.own)
+        try:
+            hosted = deployments(place, root, config, cron, workers, timezone)
+        except ValueError as error:
+            raise FieldcalError("wrong_option", f'--cron "{cron}", --timezone: {_last_line(error)}') from error
+        when = f'"{cron}" ({timezone or local_timezone()})'
+        say(f"Serving at {url}: nightly over {place.absolute()} at {when}, into {root}")
+        say("Sessions: fieldcal trigger SESSION_DIR" + (f", and by themselves in {watch}" if watch else ""))
+        host(hosted, url, watch.absolute() if watch else None, quiet)
+    return 0
+
+
+def trigger(
+    folder: SessionFolder,
+    /,
+    *,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: Config = None,
+) -> int:
+    """Start the session flow on the server for a finished field session; asking twice runs it once.
+
+    Parameters
+    ----------
+    folder
+        Folder of the session: ARCHIVE/<vehicle>/<session>.
+    """
+    from fieldcal.cli.show import print_json
+    from fieldcal.errors import FieldcalError
+    from fieldcal.flows.server import prepare_environment
+    from fieldcal.flows.trigger import server_address
+    from fieldcal.flows.trigger import trigger as ask
+    from fieldcal.warehouse import Warehouse
+
+    if not folder.is_dir():
+        raise FieldcalError("no_session", f"There is no session folder at {folder}.")
+    root = Warehouse(warehouse).root
+    url = server_address(root)
+    prepare_environment(root, serving=True)
+    changes = {"warehouse": warehouse, "config": config}
+    asked = ask(url, folder.absolute(), **{name: str(path.absolute()) for name, path in changes.items() if path})
+    if as_json:
+        print_json(asked)
+    else:
+        known = "is scheduled" if asked["created"] else f"was asked for before; it is {asked['state'].lower()}"
+        print(f"{folder}: flow run {asked['name']} {known}")
+    return 0
+
+
+def _last_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    telling = [line for line in lines if "error" in line.lower() or "invalid" in line.lower()]
+    return (telling or lines or [""])[0]

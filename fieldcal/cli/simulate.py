@@ -1,0 +1,174 @@
+"""`fieldcal simulate`: the paper's experiment with known truth, as an archive of logs."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from fieldcal.cli.options import AsJson, UnusedConfig, UnusedRoot
+
+OFF = Parameter(negative="")
+
+
+def simulate(
+    folder: Path,
+    /,
+    *,
+    seed: int = 0,
+    log_format: Annotated[Literal["mcap", "csv"], Parameter(name="--format")] = "mcap",
+    vehicles: int = 1,
+    sessions: int = 1,
+    flights: int = 1,
+    duration: float = 40.0,
+    translation_rms: float = 0.0,
+    lever_arm: str = "0,0,0",
+    dip_deg: float = 0.0,
+    temperature: str = "25,25",
+    bias_per_degc: list[str] | None = None,
+    scale_per_degc: list[str] | None = None,
+    gyro_random_walk: float = 0.0,
+    lost_share: float = 0.0,
+    jitter: float = 0.0,
+    magnetic_bursts: int = 0,
+    vps_dropouts: float = 0.0,
+    vps_outliers: float = 0.0,
+    vps_misalignment_deg: float = 0.0,
+    no_noise: Annotated[bool, OFF] = False,
+    no_quantisation: Annotated[bool, OFF] = False,
+    no_band_limit: Annotated[bool, OFF] = False,
+    no_vps: Annotated[bool, OFF] = False,
+    as_json: AsJson = False,
+    warehouse: UnusedRoot = None,
+    config: UnusedConfig = None,
+) -> int:
+    """Write simulated logs and, beside each, the truth.
+
+    Parameters
+    ----------
+    folder
+        Archive to write: FOLDER/<vehicle>/<session>/<flight>, with its fieldcal.toml.
+    seed
+        Equal seeds give equal logs.
+    log_format
+        One MCAP file a flight, or a folder of CSVs.
+    vehicles, sessions, flights
+        How many vehicles, sessions of each, flights in each.
+    duration
+        Seconds.
+    translation_rms
+        Translation, rms of the acceleration vector, m/s².
+    lever_arm
+        x,y,z from the centre of mass to the sensor, body axes, m.
+    dip_deg
+        Magnetic dip, degrees; 0 is the paper's horizontal field.
+    temperature
+        from,to in °C over a flight.
+    bias_per_degc, scale_per_degc
+        Temperature coefficients: gyroscope=x,y,z in rad/s (or m/s², norm) and relative to the scale.
+    gyro_random_walk
+        rad/s per √s.
+    lost_share
+        Share of samples lost.
+    jitter
+        Seconds, rms, of the stamps.
+    magnetic_bursts
+        How many times a magnet comes near.
+    vps_dropouts, vps_outliers
+        Share of VPS poses lost, and wrong.
+    vps_misalignment_deg
+        Rotation between the frames of VPS and IMU.
+    no_noise, no_quantisation, no_band_limit, no_vps
+        Leave it out.
+    """
+    from fieldcal.cli.show import print_json
+    from fieldcal.simulation.archive import write_flights
+    from fieldcal.simulation.experiment import Experiment
+    from fieldcal.words.talk import say
+
+    experiment = Experiment(
+        seed=seed,
+        duration_s=duration,
+        translation_rms_mps2=translation_rms,
+        lever_arm_m=_triple("--lever-arm", lever_arm),
+        dip_rad=math.radians(dip_deg),
+        temperature_degc=_pair("--temperature", temperature),
+        bias_per_degc=_by_sensor("--bias-per-degc", bias_per_degc),
+        scale_per_degc=_by_sensor("--scale-per-degc", scale_per_degc),
+        gyro_random_walk=gyro_random_walk,
+        lost_share=lost_share,
+        jitter_s=jitter,
+        magnetic_bursts=magnetic_bursts,
+        vps_dropout_share=vps_dropouts,
+        vps_outlier_share=vps_outliers,
+        vps_misalignment_rad=math.radians(vps_misalignment_deg),
+        noise=not no_noise,
+        quantisation=not no_quantisation,
+        band_limit=not no_band_limit,
+        vps=not no_vps,
+    )
+    for name, value, lowest in (
+        ("--duration", duration, 5.0),
+        ("--vehicles", vehicles, 1),
+        ("--sessions", sessions, 1),
+        ("--flights", flights, 1),
+    ):
+        if value < lowest:
+            raise _wrong(f"{name} must be {lowest:g} or more.")
+    for name, share in (
+        ("--lost-share", lost_share),
+        ("--vps-dropouts", vps_dropouts),
+        ("--vps-outliers", vps_outliers),
+    ):
+        if not 0 <= share < 1:
+            raise _wrong(f"{name} is a share: from 0 to below 1.")
+    logs = write_flights(
+        folder, experiment, vehicles=vehicles, sessions=sessions, flights=flights, log_format=log_format
+    )
+    if as_json:
+        print_json({"folder": str(folder), "logs": [str(log) for log in logs]})
+    else:
+        for log in logs:
+            print(log)
+        say(f"{len(logs)} logs with their truth in {folder}; next: fieldcal nightly {folder}")
+    return 0
+
+
+def _by_sensor(name: str, texts: list[str] | None) -> dict[str, tuple[float, float, float]]:
+    from fieldcal.simulation.experiment import SENSORS
+
+    result = {}
+    for text in texts or []:
+        sensor, _, values = text.partition("=")
+        if sensor not in SENSORS:
+            raise _wrong(f'{name} needs <sensor>=x,y,z with one of {", ".join(SENSORS)}, not "{text}".')
+        result[sensor] = _triple(name, values)
+    return result
+
+
+def _triple(name: str, text: str) -> tuple[float, float, float]:
+    values = _numbers(name, text, 3)
+    return values[0], values[1], values[2]
+
+
+def _pair(name: str, text: str) -> tuple[float, float]:
+    values = _numbers(name, text, 2)
+    return values[0], values[1]
+
+
+def _numbers(name: str, text: str, count: int) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        raise _wrong(f'{name} needs {count} numbers separated by commas, not "{text}".')
+    return values
+
+
+def _wrong(sentence: str) -> Any:
+    from fieldcal.errors import FieldcalError
+
+    return FieldcalError("wrong_option", sentence)

@@ -1,0 +1,1 @@
+"""`fieldcal.toml`: what the logs cannot say themselves, and the parameters of the stages."""

@@ -1,0 +1,1 @@
+"""The clock of the visual positioning system against that of the IMU."""

@@ -1,0 +1,351 @@
+"""Synchronise the VPS with the IMU: clock offset, clock drift and the two constant rotations between their frames.
+
+Coarse: masked, normalised cross-correlation of rotation-rate norms (no frame alignment needed), parabolic peak.
+Fine: Gauss–Newton on the vector rates, ω_imu(t) ≈ M ω_vps(t) + c with the VPS stamps stretched and moved; the free
+3×3 M takes up any constant rotation and any calibration the gyroscope still lacks, so neither can move the lag.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import fft
+
+from fieldcal.errors import UnusableFlight
+from fieldcal.estimation.smoothing import differentiate, low_pass
+from fieldcal.estimation.statistics import huber_weights, least_squares_covariance, robust_sigma
+from fieldcal.geometry.rotation import (
+    Array,
+    body_rate,
+    conjugate,
+    continuous,
+    from_rotation_vector,
+    mean_quaternion,
+    multiply,
+    slerp,
+    to_rotation_vector,
+)
+
+FINE_CUTOFF_HZ = 8.0
+# Chance peaks of unrelated motions reach 0.9 in the coarse correlation; the vector fit tells them.
+MIN_EXPLAINED, MAX_SKEW_PPM, MAX_LAG_SD_S = 0.6, 2000.0, 0.01
+
+
+@dataclass(frozen=True)
+class UniformRates:
+    """Rates on a uniform grid starting at `start_s` with `interval_s`: `rate` (n, 3), rad/s or logged units; `valid`
+    (n,)."""
+
+    start_s: float
+    interval_s: float
+    rate: Array
+    valid: np.ndarray
+
+    @property
+    def t(self) -> Array:
+        """Grid times, s."""
+        return self.start_s + self.interval_s * np.arange(len(self.rate))
+
+
+@dataclass(frozen=True)
+class SyncFit:
+    """VPS clock + lag = IMU clock: `lag_mid_s` at mid-record, IMU time `reference_s`; `skew_ppm` > 0: VPS clock fast;
+    `covariance` (2, 2) of the lag at mid-record, s, and the skew (a ratio); `first_s` the first IMU sample.
+
+    `explained` is the share of the rates' variance that the VPS accounts for; `peak` and `runner_up` are
+    correlations (the second: best one outside the peak); `matrix` (3, 3) maps VPS body rates to logged rates."""
+
+    lag_mid_s: float
+    skew_ppm: float
+    covariance: Array
+    peak: float
+    runner_up: float
+    peak_width_s: float
+    explained: float
+    matrix: Array
+    reference_s: float
+    first_s: float
+
+    @property
+    def lag_s(self) -> float:
+        """Lag at the first IMU sample, s."""
+        return self.lag_mid_s + 1e-6 * self.skew_ppm * (self.reference_s - self.first_s)
+
+    @property
+    def lag_sd_s(self) -> float:
+        """Standard deviation of the lag at mid-record, s."""
+        return float(np.sqrt(self.covariance[0, 0]))
+
+    @property
+    def skew_sd_ppm(self) -> float:
+        """Standard deviation of the skew, ppm."""
+        return float(1e6 * np.sqrt(self.covariance[1, 1]))
+
+    def to_imu_clock(self, t_vps: ArrayLike) -> Array:
+        """VPS stamps, s, on the IMU clock."""
+        t = np.asarray(t_vps, dtype=float)
+        # t_vps = (t_imu − ref)(1 + skew) + ref − lag_mid
+        return (t + self.lag_mid_s - self.reference_s) / (1 + 1e-6 * self.skew_ppm) + self.reference_s
+
+
+def mask_outliers(t: ArrayLike, q: ArrayLike, *, max_rate: float = 40.0) -> np.ndarray:
+    """Which VPS attitudes (n, 4) at stamps t to keep, (n,) bool: finite, unit, near their neighbours.
+
+    A sample is an outlier when the shortest path over it (before → it → after) is longer than the direct one by more
+    than the motion explains (robust threshold), or implies more than `max_rate` rad/s."""
+    t, q = np.asarray(t, dtype=float), np.asarray(q, dtype=float)
+    keep = np.isfinite(q).all(axis=1) & (np.abs(np.linalg.norm(q, axis=1) - 1.0) < 0.05)
+    keep &= np.r_[True, np.diff(t) > 0]
+    for _ in range(3):
+        i = np.flatnonzero(keep)
+        if len(i) < 5:
+            return keep
+        middle = _deviation(q[i[:-2]], q[i[1:-1]], q[i[2:]], t[i])
+        limit = max(10.0 * robust_sigma(middle), 2e-3)
+        bad = np.zeros(len(i), dtype=bool)
+        bad[1:-1] = middle > limit
+        step = np.linalg.norm(to_rotation_vector(multiply(conjugate(q[i[:-1]]), q[i[1:]])), axis=1)
+        fast = step > max_rate * np.maximum(np.diff(t[i]), 1e-4) + 2e-3
+        bad[1:-1] |= fast[:-1] & fast[1:]
+        # Of neighbouring suspects only the worst goes at a time: a single outlier also spoils the two beside it.
+        score = np.r_[0.0, middle, 0.0]
+        # The first and last are seen only by their neighbours: one that is off while the next but one is not.
+        for end, beside, beyond in ((0, 1, 2), (-1, -2, -3)):
+            if bad[beside] and not bad[beyond]:
+                bad[end], bad[beside], score[end] = True, False, np.inf
+        worst = bad & (score >= np.r_[0.0, score[:-1]]) & (score >= np.r_[score[1:], 0.0])
+        if not worst.any():
+            break
+        keep[i[worst]] = False
+    return keep
+
+
+def _deviation(before: Array, it: Array, after: Array, t: Array) -> Array:
+    """Angle between each attitude and the one interpolated between its neighbours, rad."""
+    share = ((t[1:-1] - t[:-2]) / (t[2:] - t[:-2]))[:, None]
+    step = to_rotation_vector(multiply(conjugate(before), after))
+    predicted = multiply(before, from_rotation_vector(share * step))
+    return np.asarray(np.linalg.norm(to_rotation_vector(multiply(conjugate(predicted), it)), axis=1))
+
+
+def vps_rates(t: ArrayLike, q: ArrayLike, interval_s: float, *, max_gap_s: float = 0.05) -> UniformRates:
+    """Body rates from VPS attitudes (n, 4) at stamps t (n,), on a uniform grid; gaps are masked, never crossed.
+
+    SLERP to the grid, local smoothed differentiation, ω = 2Ξᵀq̇."""
+    t, q = np.asarray(t, dtype=float), continuous(q)
+    grid = t[0] + interval_s * np.arange(int((t[-1] - t[0]) / interval_s))
+    on_grid = slerp(t, q, grid)
+    i = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 2)
+    valid = (t[i + 1] - t[i]) <= max_gap_s
+    # The derivative at a place uses its neighbours: grow the gaps by the window.
+    spoiled = np.convolve(~valid, np.ones(9), mode="same") > 0
+    rate = body_rate(on_grid, differentiate(on_grid, interval_s))
+    return UniformRates(float(t[0]), interval_s, rate, ~spoiled)
+
+
+def imu_rates(t: ArrayLike, rate: ArrayLike, interval_s: float, *, max_gap_s: float = 0.1) -> UniformRates:
+    """IMU rates (n, 3) at stamps t (n,) on a uniform grid, linear in between; gaps masked."""
+    t, rate = np.asarray(t, dtype=float), np.asarray(rate, dtype=float)
+    grid = t[0] + interval_s * np.arange(int((t[-1] - t[0]) / interval_s))
+    i = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 2)
+    valid = (t[i + 1] - t[i]) <= max_gap_s
+    on_grid = np.stack([np.interp(grid, t, column) for column in rate.T], axis=1)
+    return UniformRates(float(t[0]), interval_s, on_grid, valid)
+
+
+def correlate(
+    imu: UniformRates, vps: UniformRates, max_lag_s: float, *, min_overlap_s: float = 5.0
+) -> tuple[float, float, float, float]:
+    """Coarse lag by masked, normalised FFT cross-correlation of rate norms: (lag_s, peak, runner_up, width_s).
+
+    At each lag only samples valid in both count, and means and norms are taken over those (Padfield 2012)."""
+    a, b = np.linalg.norm(imu.rate, axis=1), np.linalg.norm(vps.rate, axis=1)
+    ma, mb = imu.valid.astype(float), vps.valid.astype(float)
+    a, b = (a - a[imu.valid].mean()) * ma, (b - b[vps.valid].mean()) * mb
+    size = fft.next_fast_len(len(a) + len(b), real=True)
+
+    def cross(x: Array, y: Array) -> Array:
+        return np.asarray(fft.irfft(fft.rfft(x, size) * np.conj(fft.rfft(y, size)), size))
+
+    overlap = np.maximum(cross(ma, mb), 1e-9)
+    sum_a, sum_b = cross(a, mb), cross(ma, b)
+    variance = (cross(a * a, mb) - sum_a**2 / overlap) * (cross(ma, b * b) - sum_b**2 / overlap)
+    enough = overlap > min(min_overlap_s / imu.interval_s, 0.5 * min(ma.sum(), mb.sum()))
+    floor = max(1e-6 * float(np.sum(a * a)) * float(np.sum(b * b)), 1e-300)
+    r = np.where(
+        enough & (variance > floor), (cross(a, b) - sum_a * sum_b / overlap) / np.sqrt(np.maximum(variance, floor)), 0.0
+    )
+    shift = np.arange(size)
+    shift = np.where(shift > size // 2, shift - size, shift)
+    lag = imu.start_s - vps.start_s + shift * imu.interval_s
+    r[np.abs(lag) > max_lag_s] = -1.0
+    order = np.argsort(lag)
+    r, lag = r[order], lag[order]
+    k = int(np.argmax(r))
+    # Neighbourhood of the peak: down to half its height on either side.
+    low = k - int(np.argmax(r[k::-1] < 0.5 * r[k]))
+    high = k + int(np.argmax(r[k:] < 0.5 * r[k]))
+    away = np.ones(len(r), dtype=bool)
+    away[low : high + 1] = False
+    runner_up = float(r[away].max()) if away.any() else 0.0
+    offset = 0.0
+    if 0 < k < len(r) - 1:
+        left, mid, right = r[k - 1], r[k], r[k + 1]
+        curvature = left - 2 * mid + right
+        offset = 0.5 * (left - right) / curvature if curvature < 0 else 0.0
+    return float(lag[k] + offset * imu.interval_s), float(r[k]), runner_up, float((high - low) * imu.interval_s)
+
+
+def synchronise(
+    t_imu: ArrayLike,
+    rate_imu: ArrayLike,
+    t_vps: ArrayLike,
+    q_vps: ArrayLike,
+    *,
+    max_lag_s: float = 60.0,
+    min_peak: float = 0.5,
+    max_gap_s: float = 0.05,
+) -> SyncFit:
+    """Lag and drift of the VPS clock against the IMU's.
+
+    Parameters
+    ----------
+    t_imu, rate_imu : (n,), (n, 3) arrays
+        IMU stamps, s, and gyroscope readings, any axes; calibrated or, if need be, logged units less their median.
+    t_vps, q_vps : (m,), (m, 4) arrays
+        VPS stamps, s, own clock, and attitudes, outliers already removed (`mask_outliers`).
+
+    Raises
+    ------
+    UnusableFlight
+        `vps_too_short`, `flat_peak` (peak below `min_peak`), `ambiguous_peak` (runner-up within 2 % of the peak),
+        `not_the_same_motion` (the vector fit fails at the best lag); `measured` has the numbers.
+
+    Notes
+    -----
+    The lag contains the difference of the two sensors' group delays. Both sides get the same zero-phase low-pass.
+    """
+    t_imu, t_vps = np.asarray(t_imu, dtype=float), np.asarray(t_vps, dtype=float)
+    if len(t_vps) < 50 or t_vps[-1] - t_vps[0] < 2.0 or len(t_imu) < 50:
+        raise UnusableFlight(
+            "vps_too_short", "The VPS or IMU record is too short to synchronise.", {"n_vps": len(t_vps)}
+        )
+    interval = float(max(np.median(np.diff(t_imu)), 1e-3))
+    imu = imu_rates(t_imu, rate_imu, interval)
+    vps = vps_rates(t_vps, q_vps, interval, max_gap_s=max_gap_s)
+    imu, vps = (_smoothed(s) for s in (imu, vps))
+    lag, peak, runner_up, width = correlate(imu, vps, max_lag_s)
+    measured = {"peak": peak, "runner_up": runner_up, "peak_width_s": width, "coarse_lag_s": lag}
+    if peak < min_peak:
+        raise UnusableFlight(
+            "flat_peak",
+            f"The best correlation between IMU and VPS is {peak:.2f}, below {min_peak:.2f}: not the same motion.",
+            measured,
+        )
+    if runner_up > 0.98 * peak:
+        raise UnusableFlight(
+            "ambiguous_peak",
+            f"Two lags fit about equally well (correlations {peak:.3f} and {runner_up:.3f}): add an unrepeated motion.",
+            measured,
+        )
+    fit = _refine(imu, vps, lag, float(t_imu[0]), 0.5 * float(t_imu[0] + t_imu[-1]), measured)
+    measured |= {"explained": fit.explained, "skew_ppm": fit.skew_ppm, "lag_sd_s": fit.lag_sd_s}
+    if fit.explained < MIN_EXPLAINED or abs(fit.skew_ppm) > MAX_SKEW_PPM or fit.lag_sd_s > MAX_LAG_SD_S:
+        raise UnusableFlight(
+            "not_the_same_motion",
+            f"At the best lag the VPS explains {100 * fit.explained:.0f} % of the gyroscope's variance, with a clock"
+            f" drift of {fit.skew_ppm:.0f} ppm and a lag known to {1e3 * fit.lag_sd_s:.2g} ms: not the same motion.",
+            measured,
+        )
+    return fit
+
+
+def _smoothed(s: UniformRates) -> UniformRates:
+    """Low-passed rates; what the filter's main lobe mixes with a gap or an end is masked too."""
+    rate = low_pass(s.rate, FINE_CUTOFF_HZ, s.interval_s)
+    reach = round(0.5 / FINE_CUTOFF_HZ / s.interval_s)
+    bad = np.pad(~s.valid, reach, constant_values=True)
+    total = np.concatenate([[0], np.cumsum(bad)])
+    near = total[2 * reach + 1 :] - total[: len(s.valid)] > 0
+    return UniformRates(s.start_s, s.interval_s, rate, ~near)
+
+
+def _refine(
+    imu: UniformRates, vps: UniformRates, lag: float, first: float, middle: float, measured: dict[str, float]
+) -> SyncFit:
+    """Gauss–Newton for offset, drift and the affine map M, c between the rates, on the IMU's grid."""
+    from scipy.interpolate import CubicSpline
+
+    spline = CubicSpline(vps.t, vps.rate)
+    slope = spline.derivative()
+    skew, matrix = 0.0, np.eye(3)
+    t = imu.t
+    for _ in range(12):
+        # t_vps = (t − middle)(1 + skew) + middle − lag
+        at = (t - middle) * (1 + skew) + middle - lag
+        nearest = np.rint((at - vps.start_s) / vps.interval_s)
+        inside = (nearest >= 1) & (nearest < len(vps.rate) - 1) & imu.valid
+        inside[inside] = vps.valid[nearest[inside].astype(int)]
+        w, w_dot = spline(at[inside]), slope(at[inside])
+        x = np.column_stack([w, np.ones(len(w))])
+        weight: Array = np.ones(len(w))
+        for _ in range(3):
+            xw = x * weight[:, None]
+            solution = np.linalg.lstsq(xw.T @ x, xw.T @ imu.rate[inside], rcond=None)[0]
+            residual = imu.rate[inside] - x @ solution
+            length = np.linalg.norm(residual, axis=1)
+            weight = huber_weights(length, robust_sigma(length))
+        matrix = solution[:3].T
+        # Sensitivity of the prediction to lag (minus) and skew; the affine map's own columns are projected out.
+        moved = w_dot @ matrix.T
+        columns = np.stack([-moved, moved * (t[inside] - middle)[:, None]], axis=2)
+        flat = columns.reshape(len(w), 6)
+        flat = flat - x @ np.linalg.lstsq(xw.T @ x, (x * weight[:, None]).T @ flat, rcond=None)[0]
+        root = np.sqrt(weight)
+        sensitivity = flat.reshape(len(w), 3, 2) * root[:, None, None]
+        a = sensitivity.reshape(-1, 2)
+        step = np.linalg.lstsq(a.T @ a, a.T @ (residual * root[:, None]).reshape(-1), rcond=1e-18)[0]
+        lag, skew = lag + float(step[0]), skew + float(step[1])
+        if abs(step[0]) < 1e-9 and abs(step[1]) < 1e-10:
+            break
+    spread = imu.rate[inside] - np.average(imu.rate[inside], axis=0, weights=weight)
+    explained = 1.0 - float(weight @ np.sum(residual**2, axis=1)) / float(weight @ np.sum(spread**2, axis=1))
+    # Both sides are filtered: the residual's colour sets the sd.
+    _, covariance = least_squares_covariance(sensitivity, residual * root[:, None])
+    return SyncFit(
+        lag_mid_s=lag,
+        skew_ppm=1e6 * skew,
+        covariance=covariance,
+        explained=explained,
+        peak=measured["peak"],
+        runner_up=measured["runner_up"],
+        peak_width_s=measured["peak_width_s"],
+        matrix=matrix,
+        reference_s=middle,
+        first_s=first,
+    )
+
+
+def rotation_between(a: ArrayLike, b: ArrayLike) -> Array:
+    """The rotation (3, 3) with b ≈ R a for vectors (n, 3): Wahba by SVD."""
+    u, _, vt = np.linalg.svd(np.asarray(b, dtype=float).T @ np.asarray(a, dtype=float))
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
+
+
+def align_frames(q_imu: ArrayLike, q_vps: ArrayLike, *, iterations: int = 10) -> tuple[Array, Array]:
+    """The two constant rotations, as quaternions (world, body), with q_imu ≈ world ⊗ q_vps ⊗ body.
+
+    Alternating Wahba solutions over matched attitudes (n, 4), robust to single bad ones; where the motion
+    leaves a part of one unobserved, it stays at the identity's side."""
+    q_imu, q_vps = np.asarray(q_imu, dtype=float), np.asarray(q_vps, dtype=float)
+    body = np.array([0.0, 0.0, 0.0, 1.0])
+    weight: Array = np.ones(len(q_imu))
+    for _ in range(iterations):
+        world = mean_quaternion(multiply(q_imu, conjugate(multiply(q_vps, body))), weight)
+        body = mean_quaternion(multiply(conjugate(multiply(world, q_vps)), q_imu), weight)
+        error = to_rotation_vector(multiply(conjugate(multiply(multiply(world, q_vps), body)), q_imu))
+        length = np.linalg.norm(error, axis=1)
+        weight = huber_weights(length, robust_sigma(length))
+    return world, body

@@ -1,0 +1,247 @@
+"""What the readings of a triad give away by themselves: dead, stuck, clipped or random channels, a wrong unit.
+
+Every check is a number against a limit. Limits are wide: what passes here may still be refused by the fits, but what
+fails here is not worth a fit. Readings are as logged, (n, 3); stamps in seconds, increasing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fieldcal.geometry.rotation import Array
+
+AXES = "xyz"
+TEN_SAMPLES = 10
+
+STUCK_S = 1.0
+"""A channel that lives changes within a second."""
+
+STUCK_TIMES = 50.0
+"""A stuck channel holds a value so many times longer than it does otherwise (99th percentile of holding times)."""
+
+STUCK_SHARE = 0.02
+"""Share of the recording that may be stuck."""
+
+CLIPPED_RATIO = 3.0
+"""A rail holds so many times the samples of the three levels before it together; a smooth peak holds as many."""
+
+CLIPPED_SHARE = 1e-3
+"""Share of samples at a rail beyond which a fit is biased."""
+
+LEVELS = 20
+"""Fewer different values show no rail."""
+
+WHITE_RATIO = 0.8
+"""Successive readings of a moving body resemble each other: variance of their differences over twice the variance."""
+
+LOUD = {"gyroscope": 5.0, "accelerometer": 20.0}
+"""Standard deviation, rad/s and m/s², beyond which noise is no sensor's."""
+
+GRAVITY_RATIO = (0.5, 2.0)
+"""Median length of specific force over gravity in any flight that is not a fall or a launch."""
+
+FIELD_RATIO = (0.1, 8.0)
+"""Median length of the logged field over the local one: hard iron may be several times the field."""
+
+EARTH_FIELD_T = 45e-6
+FASTEST_RADPS = 70.0
+"""Twice the widest range of common gyroscopes (2000 °/s)."""
+
+RATE_WINDOW_S = 5.0
+RATE_CHANGE = 1.3
+GAP_INTERVALS = 1.5
+PAUSE_S = 1.0
+"""Longer ones are no dropouts but pauses, which ingest tells of."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One thing that is wrong with a channel or triad: `value` against `limit`. `fatal`: no fit may use the triad."""
+
+    sensor: str
+    axis: str
+    code: str
+    value: float
+    limit: float
+    fatal: bool
+    sentence: str
+
+    def plain(self) -> dict[str, Any]:
+        """Plain JSON."""
+        return asdict(self)
+
+
+def channel_faults(sensor: str, t: ArrayLike, logged: ArrayLike, unit: str, si_scale: float | None) -> list[Fault]:
+    """Dead, stuck, clipped and random channels of one triad.
+
+    Parameters
+    ----------
+    sensor : str
+        "gyroscope", "accelerometer" or "magnetometer".
+    t : (n,) array
+        Stamps, s.
+    logged : (n, 3) array
+        Readings; n ≥ 10.
+    unit : str
+        Unit of the readings, for sentences.
+    si_scale : float or None
+        From the logged unit to rad/s or m/s²; None for counts and magnetometers.
+    """
+    t, x = np.asarray(t, dtype=float), np.asarray(logged, dtype=float)
+    faults = []
+    for i, axis in enumerate(AXES):
+        dead = _dead(sensor, axis, x[:, i], unit)
+        if dead is not None:
+            faults.append(dead)
+            continue
+        faults += [f for f in (_stuck(sensor, axis, t, x[:, i], unit), _clipped(sensor, axis, x[:, i], unit)) if f]
+        if si_scale is not None and sensor in LOUD:
+            random = _random(sensor, axis, x[:, i] * si_scale, LOUD[sensor])
+            faults += [random] if random else []
+    return faults
+
+
+def _dead(sensor: str, axis: str, x: Array, unit: str) -> Fault | None:
+    if np.ptp(x) > 0:
+        return None
+    code = "all_zero" if x[0] == 0 else "stuck"
+    sentence = f"The {sensor}'s {axis} reads {x[0]:.6g} {unit} in all {len(x)} samples: it is dead or not connected."
+    return Fault(sensor, axis, code, 1.0, STUCK_SHARE, True, sentence)
+
+
+def _stuck(sensor: str, axis: str, t: Array, x: Array, unit: str) -> Fault | None:
+    """A value that is held for far longer than the channel holds values otherwise."""
+    start = np.flatnonzero(np.r_[True, x[1:] != x[:-1]])
+    end = np.r_[start[1:], len(x)] - 1
+    held = t[end] - t[start]
+    usual = float(np.quantile(np.sort(held)[: max(1, len(held) - TEN_SAMPLES)], 0.99))
+    limit = max(STUCK_S, STUCK_TIMES * usual)
+    stuck = held > limit
+    if not stuck.any():
+        return None
+    share, longest = float(held[stuck].sum() / (t[-1] - t[0])), int(np.argmax(held))
+    sentence = (
+        f"The {sensor}'s {axis} stands at {x[start[longest]]:.6g} {unit} for {held[longest]:.1f} s"
+        f" ({100 * share:.1f} % of the recording in all) where it else changes within {usual:.3g} s: it was stuck."
+    )
+    return Fault(sensor, axis, "stuck", share, STUCK_SHARE, share > STUCK_SHARE, sentence)
+
+
+def _clipped(sensor: str, axis: str, x: Array, unit: str) -> Fault | None:
+    """A rail: an extreme value that is met far more often than the values just before it."""
+    levels, counts = np.unique(x, return_counts=True)
+    if len(levels) < LEVELS:
+        return None
+    ends = ((levels[-1], counts[-1], counts[-4:-1]), (levels[0], counts[0], counts[1:4]))
+    rails = [(level, n) for level, n, before in ends if n >= TEN_SAMPLES and n > CLIPPED_RATIO * before.sum()]
+    if not rails:
+        return None
+    at = int(sum(n for _, n in rails))
+    share = at / len(x)
+    where = " and ".join(f"{level:.6g} {unit}" for level, _ in rails)
+    sentence = f"The {sensor}'s {axis} is clipped at {where}: {at} of {len(x)} samples ({100 * share:.2f} %)."
+    return Fault(sensor, axis, "saturated", share, CLIPPED_SHARE, share > CLIPPED_SHARE, sentence)
+
+
+def _random(sensor: str, axis: str, x: Array, loud: float) -> Fault | None:
+    """Successive readings that know nothing of each other, far louder than any sensor's noise."""
+    spread = float(np.std(x))
+    ratio = float(np.mean(np.diff(x) ** 2) / (2.0 * spread**2))
+    if spread < loud or ratio < WHITE_RATIO:
+        return None
+    sentence = (
+        f"The {sensor}'s {axis} is noise: its readings scatter by {spread:.3g} (SI) and successive ones are unrelated"
+        f" (ratio {ratio:.2f}; a moving body shows below {WHITE_RATIO})."
+    )
+    return Fault(sensor, axis, "random", ratio, WHITE_RATIO, True, sentence)
+
+
+def accelerometer_unit(logged: ArrayLike, unit: str, in_mps2: float, gravity_mps2: float) -> Fault | None:
+    """Whether the length of specific force, (n, 3) readings in `unit` (`in_mps2` m/s²), can be gravity's."""
+    length = float(np.median(np.linalg.norm(np.asarray(logged, dtype=float), axis=1)))
+    ratio = length * in_mps2 / gravity_mps2
+    if GRAVITY_RATIO[0] <= ratio <= GRAVITY_RATIO[1]:
+        return None
+    units = {"m/s^2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "cm/s^2": 0.01}
+    return _unit_fault("accelerometer", unit, length, ratio, GRAVITY_RATIO, units, gravity_mps2, "gravity")
+
+
+def magnetometer_unit(logged: ArrayLike, unit: str, in_tesla: float, field_t: float | None) -> Fault | None:
+    """Whether the length of the field, (n, 3) readings in `unit` (`in_tesla` T), can be the local one (T) or the
+    Earth's."""
+    length = float(np.median(np.linalg.norm(np.asarray(logged, dtype=float), axis=1)))
+    expected = field_t or EARTH_FIELD_T
+    ratio = length * in_tesla / expected
+    if FIELD_RATIO[0] <= ratio <= FIELD_RATIO[1]:
+        return None
+    units = {"T": 1.0, "G": 1e-4, "mG": 1e-7, "uT": 1e-6, "nT": 1e-9}
+    return _unit_fault("magnetometer", unit, length, ratio, FIELD_RATIO, units, expected, "the local field")
+
+
+def gyroscope_unit(logged: ArrayLike, unit: str, in_radps: float) -> Fault | None:
+    """Whether rates, (n, 3) readings in `unit` (`in_radps` rad/s), are within what gyroscopes can measure."""
+    fastest = float(np.quantile(np.abs(np.asarray(logged, dtype=float)), 0.999)) * in_radps
+    if fastest <= FASTEST_RADPS:
+        return None
+    sentence = (
+        f"The gyroscope reads up to {fastest:.4g} rad/s (99.9 % of samples lie below) when its unit is {unit}; none"
+        f" measures more than {FASTEST_RADPS:.0f}. The readings look like "
+        + ("deg/s" if np.degrees(1.0) * FASTEST_RADPS >= fastest else "counts")
+        + ". Correct units.gyroscope."
+    )
+    return Fault("gyroscope", "", "wrong_unit", fastest, FASTEST_RADPS, True, sentence)
+
+
+def _unit_fault(
+    sensor: str,
+    unit: str,
+    length: float,
+    ratio: float,
+    allowed: tuple[float, float],
+    units: dict[str, float],
+    expected: float,
+    what: str,
+) -> Fault:
+    distance = {name: abs(np.log(max(length, 1e-300) * scale / expected)) for name, scale in units.items()}
+    nearest = min(distance, key=lambda name: distance[name])
+    hint = f"; in {nearest} they would be {length * units[nearest] / expected:.2f}" if distance[nearest] < 1 else ""
+    sentence = (
+        f"The {sensor}'s readings are {ratio:.3g} times as long as {what} when their unit is {unit}{hint}. Correct"
+        f" units.{sensor}."
+    )
+    return Fault(sensor, "", "wrong_unit", ratio, allowed[ratio > 1], True, sentence)
+
+
+def sampling_faults(sensor: str, t: ArrayLike) -> list[Fault]:
+    """Samples that are missing, and a rate that changes, from stamps (n,), s. Neither is fatal: fits use the stamps."""
+    t = np.asarray(t, dtype=float)
+    step = np.diff(t)
+    interval = float(np.median(step))
+    faults = []
+    lost = (step > GAP_INTERVALS * interval) & (step <= PAUSE_S)
+    missing = float(np.rint(step[lost] / interval - 1.0).sum())
+    share = missing / (len(t) + missing)
+    if share > CLIPPED_SHARE:
+        sentence = (
+            f"The {sensor} lost about {missing:.0f} samples ({100 * share:.2f} %) in {int(lost.sum())} dropouts, the"
+            f" longest {step[lost].max():.3f} s."
+        )
+        faults.append(Fault(sensor, "", "dropouts", share, CLIPPED_SHARE, False, sentence))
+    rates = _windowed_rates(t)
+    if len(rates) > 1 and rates.max() > RATE_CHANGE * rates.min():
+        sentence = f"The {sensor}'s rate changes between {rates.min():.4g} and {rates.max():.4g} Hz."
+        faults.append(Fault(sensor, "", "rate_changes", float(rates.max() / rates.min()), RATE_CHANGE, False, sentence))
+    return faults
+
+
+def _windowed_rates(t: Array) -> NDArray[np.float64]:
+    """Median rate, Hz, in each window of RATE_WINDOW_S with ten samples or more."""
+    window = np.floor((t[1:] - t[0]) / RATE_WINDOW_S).astype(np.int64)
+    step = np.diff(t)
+    start = np.flatnonzero(np.r_[True, window[1:] != window[:-1]])
+    pieces = [piece for piece in np.split(step, start[1:]) if len(piece) >= TEN_SAMPLES]
+    return np.array([1.0 / np.median(piece) for piece in pieces])

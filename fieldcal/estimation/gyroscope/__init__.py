@@ -1,0 +1,1 @@
+"""Gyroscope constants from attitude: equation error and output error."""

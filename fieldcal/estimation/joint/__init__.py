@@ -1,0 +1,1 @@
+"""All three triads and the attitude in one likelihood (method `joint`)."""

@@ -1,0 +1,59 @@
+"""How far a gyroscope's bias walks, from the rates that a better attitude leaves of it (rate random walk, IEEE 952)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.fft import dct
+
+from fieldcal.geometry.rotation import Array
+
+# Shorter periods are left out: there attitude noise, not the gyroscope's, is what the rates show. So are all but the
+# slowest of a segment: an attitude that follows a disturbed field makes rates of tens of seconds, and what tells a walk
+# from them is that it is stronger still beyond.
+SHORTEST_S, SLOWEST = 4.0, 12
+# Walk over white noise, variances of one step, searched on this grid: walks of two per cent apart.
+RATIOS = np.r_[0.0, np.geomspace(1e-9, 1e3, 601)]
+
+
+def bias_walk(rate: ArrayLike, interval_s: ArrayLike, joined: ArrayLike) -> float:
+    """Density of the random walk in a rate, by restricted maximum likelihood beside white noise.
+
+    The cosine transform makes both diagonal: with the mean taken out, a walk of variance q²Δt a step has the variance
+    q²Δt/(4 sin²(πk/2n)) in the k-th of n coefficients, white noise the same in all of them.
+
+    Parameters
+    ----------
+    rate : (n, c) array
+        Mean rate error of each interval, rad/s, of c axes alike.
+    interval_s : (n,) array
+        Length of each interval, s, nearly equal.
+    joined : (n,) array of bool
+        Intervals inside a contiguous segment; the others part segments, each of which has a mean of its own.
+
+    Returns
+    -------
+    float
+        q, rad/s/√s; 0 where white noise alone is as likely, or every segment is too short to tell.
+    """
+    rate, joined = np.asarray(rate, dtype=float), np.asarray(joined, dtype=bool)
+    if not joined.any():
+        return 0.0
+    step = float(np.mean(np.asarray(interval_s, dtype=float)[joined]))
+    edge = np.flatnonzero(np.diff(np.r_[False, joined, False]))
+    parts = [_spectrum(rate[a:b], step) for a, b in zip(edge[0::2], edge[1::2], strict=True)]
+    power, gain = (np.concatenate(own) for own in zip(*parts, strict=True))
+    if len(power) < 2 or not power.any():
+        return 0.0
+    shape = 1.0 + RATIOS[:, None] * gain
+    white = np.mean(power / shape, axis=1)
+    best = int(np.argmin(np.mean(np.log(shape), axis=1) + np.log(white)))
+    return float(np.sqrt(RATIOS[best] * white[best] / step))
+
+
+def _spectrum(rate: Array, step_s: float) -> tuple[Array, Array]:
+    """Mean square over the axes of a segment's slow cosine coefficients, and what a walk of unit steps has there."""
+    n = len(rate)
+    k = np.arange(1, 1 + min(n - 1, SLOWEST, int(2.0 * n * step_s / SHORTEST_S)))  # of period 2 n Δt / k
+    coefficient = dct(rate, type=2, axis=0, norm="ortho")[k]
+    return np.mean(coefficient**2, axis=1), 0.25 / np.sin(0.5 * np.pi * k / n) ** 2

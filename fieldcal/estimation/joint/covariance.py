@@ -1,0 +1,132 @@
+"""Standard deviations one can fly on: the joint covariance with coloured residuals, and what would make it smaller."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from fieldcal.estimation.joint.measurement_model import SENSED, Rows, sums_by_interval
+from fieldcal.estimation.joint.problem import Model, State
+from fieldcal.estimation.statistics import coloured_information, variance_by_blocks
+from fieldcal.geometry.rotation import Array
+
+
+def covariance(
+    model: Model,
+    chunks: Iterator[tuple[slice, Rows, Array]],
+    response: Array,
+    information: Array,
+    whitening: Array,
+    jumps: tuple[Array, Array],
+    process: tuple[Array, Array],
+    others: tuple[Array, Array] | None = None,
+) -> Array:
+    """Covariance (p, p) of θ: the inverse information, enlarged where the residuals say that it is too small.
+
+    Noise correlated within an interval is in the whitening already. What is correlated over longer times (a field that
+    varies from place to place, a temperature) is judged from means by interval: M = ΣΣ S̄ᵀ𝓡S̄ instead of ΣS̄ᵀS̄ for each
+    sensor row, S̄ the sensitivity with the knots eliminated. And what is not the noise that the model thinks (strong for
+    some seconds and weak for others, a translation that swings at one frequency) from the scores S̄ᵀr of blocks of
+    time, all residuals together (`variance_by_blocks`). No standard deviation is ever made smaller by either.
+
+    Parameters
+    ----------
+    chunks
+        `joint.measurement_model.sensitivities` at the solution.
+    response : (K, s, p) array
+        Knots' response N_xx⁻¹N_xθ to the parameters.
+    information : (p, p) array
+        Of θ, knots eliminated.
+    whitening : (m, r) array
+        Weights over low-frequency variance.
+    jumps : (K−1, 3), (K−1,) arrays
+        Of the attitude at the joints and 1/their sd: coloured where the gyroscope's bias drifts.
+    process : (K, c, p), (K, c) arrays
+        Whitened sensitivities, knots eliminated, and residuals of the translation's process. They are not judged for
+        colour: what is left of them after the fit has it by the fit alone.
+    others : (K, c, p), (K, c) arrays, optional
+        The same of what else was measured at the knots.
+    """
+    inverse = inverse_information(information)
+    k, r, p = len(response), whitening.shape[1], len(information)
+    sensitivity, residual, count = np.zeros((k, r + 3, p)), np.zeros((k, r + 3)), np.zeros((k, r + 3))
+    residual[:-1, r:], count[:-1, r:] = jumps[0] * jumps[1][:, None], 1.0
+    sensitivity[:-1, r:] = np.diff(response[:, :3], axis=0)
+    score = np.zeros((k, p))
+    for ties, rows, ends in chunks:
+        at = model.at[rows.own]
+        knot, share = model.knots.of_sample[at], model.knots.share[at, None, None]
+        after = np.minimum(knot + 1, k - 1)
+        between = (1.0 - share) * response[knot][:, SENSED] + share * response[after][:, SENSED]
+        root = np.sqrt(whitening[rows.own])
+        own = (rows.by_parameter - rows.by_knot @ between) * root[..., None]
+        sensitivity[ties, :r] = sums_by_interval(model, own.reshape(len(at), -1), rows.own, ties).reshape(-1, r, p)
+        sensitivity[ties, r:] += ends
+        left = rows.residual * root
+        residual[ties, :r] = sums_by_interval(model, left, rows.own, ties)
+        score[ties] += sums_by_interval(model, np.einsum("mrp,mr->mp", own, left), rows.own, ties)
+        count[ties, :r] = sums_by_interval(model, (root > 0).astype(float), rows.own, ties)
+    sensitivity[:-1, r:] *= jumps[1][:, None, None]
+    for seen, left in ((sensitivity[:, r:], residual[:, r:]), process, *([] if others is None else [others])):
+        score += np.einsum("kcp,kc->kp", seen, left)
+    scale = 1.0 / np.sqrt(np.maximum(count, 1.0))
+    sensitivity, residual = sensitivity * scale[..., None], residual * scale
+    excess = np.zeros((p, p))
+    for row in range(r + 3):
+        s, e = sensitivity[:, row], residual[:, row]
+        variance = float(np.mean(e**2))
+        if variance > 0.0:
+            excess += coloured_information(s[:, None, :], e[:, None]) / variance - s.T @ s
+    if others is not None:
+        seen, left = others
+        variance = float(np.mean(left[left != 0.0] ** 2)) if left.any() else 1.0
+        excess += coloured_information(seen, left) / variance - np.einsum("kcp,kcq->pq", seen, seen)
+    plain = np.diagonal(inverse)
+    coloured = plain + np.diagonal(inverse @ excess @ inverse)
+    elapsed = np.r_[0.0, np.cumsum(model.knots.interval_s * model.knots.joined)]
+    by_blocks = variance_by_blocks(score @ inverse, elapsed)
+    enlarged = np.sqrt(np.maximum(1.0, np.maximum(coloured, by_blocks) / plain))
+    return np.asarray(inverse * np.outer(enlarged, enlarged))
+
+
+def inverse_information(information: Array) -> Array:
+    """Inverse (p, p) of an information matrix scaled to unit diagonal; positive by the prior in it."""
+    scale = 1.0 / np.sqrt(np.diagonal(information))
+    return np.asarray(np.linalg.pinv(information * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale))
+
+
+WEAK_RELATIVE_SD = 0.01
+TURNS = ("roll", "pitch", "yaw")
+STEEP_RAD = np.pi / 4
+# Turns that swing gravity, or a steep field, along each body axis; and a level field.
+SWINGS = (("pitch",), ("roll",), ("roll", "pitch"))
+LEVEL_SWINGS = (("yaw",), ("yaw",), ("roll", "pitch"))
+
+
+def advice(model: Model, state: State, layout: Mapping[str, slice], covariance: Array, axes: Array) -> str:
+    """Which scales are weak and which motion would help, in a sentence or two; empty where all are within 1 %.
+
+    A gyroscope's axis is seen when the vehicle turns about it; a vector triad's when the sensed vector swings along it.
+    `axes` (3, 3) turns sensor axes into nose, starboard, underside."""
+    weak = []
+    for name, own in layout.items():
+        if name not in model.triads:
+            continue
+        variance = np.diagonal(covariance)[own.start : own.start + 3]
+        relative = np.sqrt(variance) / np.abs(state.values[name][:3])
+        weak += [(float(sd), name, i) for i, sd in enumerate(relative) if sd > WEAK_RELATIVE_SD]
+    if not weak:
+        return ""
+    (sd, name, axis), *others = sorted(weak, reverse=True)
+    body = int(np.argmax(np.abs(axes[:, axis])))
+    if name == "gyroscope":
+        turns: tuple[str, ...] = (TURNS[body],)
+    else:
+        level = name == "magnetometer" and abs(float(state.values["dip"][0])) < STEEP_RAD
+        turns = (LEVEL_SWINGS if level else SWINGS)[body]
+    told = f"The {name}'s {'xyz'[axis]} scale is the weakest (sd {100 * sd:.1f} %): add 60° of {' and of '.join(turns)}"
+    told += " either way, several times."
+    if others:
+        told += " Above 1 % too: " + ", ".join(f"{n} {'xyz'[i]} {100 * v:.1f} %" for v, n, i in others) + "."
+    return told

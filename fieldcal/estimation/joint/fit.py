@@ -1,0 +1,350 @@
+"""All three triads, attitude, dip and lever arm at once: the joint maximum-likelihood estimator (method `joint`).
+
+"The method is serial in nature, so good estimates must be determined at each step or the error will compound." Here
+nothing is handed on: the gyroscope is integrated between knots (`chain_solver`), every magnetometer and accelerometer
+reading is predicted in its sensor's own logged units (`measurement_model`), and Gauss–Newton moves everything together.
+Noise levels (each sensor axis, gyroscope walk, strength of the translation) are estimated beside it as variance
+components, so nothing has to be tuned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fieldcal.errors import EstimationError
+from fieldcal.estimation.joint import initialise
+from fieldcal.estimation.joint.bias_walk import bias_walk
+from fieldcal.estimation.joint.chain_solver import (
+    BRIDGE,
+    GRADIENT,
+    RIGHTS,
+    SENSORS,
+    Joints,
+    Normal,
+    Probe,
+    add_joints,
+    joint_squares,
+    solve_scaled,
+    whitened_motion,
+)
+from fieldcal.estimation.joint.covariance import covariance, inverse_information
+from fieldcal.estimation.joint.measurement_model import (
+    SENSED,
+    Rows,
+    Trajectory,
+    accumulate,
+    body_jumps,
+    layout_of,
+    residuals,
+    sensitivities,
+    trajectory,
+)
+from fieldcal.estimation.joint.pose_measurement import VpsRecord
+from fieldcal.estimation.joint.problem import CROSS, TRIADS, Model, State, off_diagonal
+from fieldcal.estimation.joint.score_corrections import logged_units, within_intervals
+from fieldcal.estimation.joint.variance_components import (
+    Levels,
+    first_levels,
+    gyro_walk,
+    passing_fields,
+    renewed_levels,
+    robust_weight,
+    unsettled_by,
+)
+from fieldcal.estimation.statistics import white_noise_sigma
+from fieldcal.geometry.rotation import Array
+
+LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
+BURST_ROUNDS = 3  # how often the fit looks for passing fields in what it left of the magnetometer
+MAX_ITERATIONS = 50
+# A step that takes back more than this part of the one before is taken to this part only: the slope lacks that of the
+# gradient's corrections, so that steps may be too long.
+TOO_FAR = 0.5
+ASTRAY = 20  # iterations after which a fit that has not settled starts anew from the constants reached
+# Settled: every step below this part of what one could claim as standard deviation, every noise level below it too.
+SETTLED = 0.1
+ROUNDING = 1e-8  # of centred parameters, which are of order one: nothing left to gain
+STILL = 0.4  # part of an axis' readings, rms, that sample-to-sample noise is where nothing else can be told of it
+# Wald test of the lever arm, χ²₃: passed by chance once in a thousand.
+LEVER_ARM_GATE = 16.3
+# What is believed before the first reading: relative sd of scales, and of biases in units of the sensed range.
+PRIOR_RELATIVE_SD = 0.5
+VAGUE = 1.0  # rad of dip, m of lever arm
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """The solution in centred coordinates; θ is ordered by `layout`.
+
+    `covariance` (p, p) of θ, coloured-residual form; `information` (p, p) with the knots eliminated; `weight` (m, r)
+    robust weights; `iterations` of all rounds; `bias_walk` of the gyroscope's bias, rad/s/√s, whose spread over the
+    record is in its covariance; `lever_arm_test` the Wald statistic (χ²₃) of a free lever arm, None where it was not
+    tried."""
+
+    model: Model
+    state: State
+    path: Trajectory
+    levels: Levels
+    weight: Array
+    layout: Mapping[str, slice]
+    covariance: Array
+    information: Array
+    iterations: int
+    bias_walk: float = 0.0
+    lever_arm_test: float | None = None
+    vps: VpsRecord | None = None
+
+    def constants(self, name: str) -> tuple[Array, Array, Array]:
+        """(λ (3,), b (3,), covariance (6, 6)) of a triad without cross-axis terms, logged units."""
+        triad, own = self.model.triads[name], self.layout[name]
+        transform = triad.to_logged()
+        return *triad.logged(self.state.values[name]), transform @ self.covariance[own, own] @ transform.T
+
+    def full_constants(self, name: str) -> tuple[Array, Array, Array]:
+        """(Λ (3, 3), b (3,), covariance (12, 12) of Λ by rows and b) of a triad with cross-axis terms, logged units."""
+        triad, own, scaled = self.model.triads[name], self.layout[name], self.state.values[name]
+        cross = f"{name}_cross"
+        e = off_diagonal(name, self.state.values[cross]) if cross in self.layout else np.zeros((3, 3))
+        matrix = scaled[:3, None] * (np.eye(3) + e) / triad.spread
+        jacobian = np.zeros((12, len(self.covariance)))
+        for i in range(3):
+            jacobian[3 * i : 3 * i + 3, own.start + i] = matrix[i] / scaled[i]
+            jacobian[9 + i, own.start + 3 + i] = 1.0
+        if cross in self.layout:
+            for k, (i, j) in enumerate(CROSS[name]):
+                jacobian[3 * i + j, self.layout[cross].start + k] = scaled[i] / triad.spread[j]
+        jacobian[9:] -= np.einsum("ijp,j->ip", jacobian[:9].reshape(3, 3, -1), triad.centre)
+        return matrix, scaled[3:] - matrix @ triad.centre, jacobian @ self.covariance @ jacobian.T
+
+
+def fit_joint(
+    model: Model,
+    start: State,
+    *,
+    free_dip: bool = True,
+    try_lever_arm: bool = True,
+    vps: VpsRecord | None = None,
+    levels: Levels | None = None,
+) -> JointFit:
+    """Estimate everything from a start within some tens of per cent.
+
+    Parameters
+    ----------
+    model : Model
+        The record, knots placed.
+    start : State
+        Attitudes of the knots within about 30°, constants with the right polarity. Its lever arm is kept unless
+        `try_lever_arm`. Optional terms (`joint.measurement_model.OPTIONAL`) that it has a value for are estimated too.
+    free_dip : bool
+        Estimate the dip angle; otherwise that of the configured field holds.
+    try_lever_arm : bool
+        Estimate the lever arm, and keep it only where it differs from none (Wald test): estimating it on data that do
+        not show it costs accuracy.
+    vps : VpsRecord, optional
+        Reference attitudes; `start` then holds `VpsRecord.start()` too.
+    levels : Levels, optional
+        Noise to start from, that of a fit nearby.
+
+    Raises
+    ------
+    EstimationError
+        `joint_singular`, `joint_diverged`, `axis_not_turned`.
+
+    Notes
+    -----
+    The likelihood is maximised over the attitudes, with every residual in logged units: that is consistent (a rate or
+    a length in SI units would shrink with its scale). Translation is noise to the accelerometer's scale, which is found
+    from gravity and lever arm alone: then no spectrum or direction of translation draws it off, whatever its prior.
+
+    It cannot see what moves all triads together with the body: a common rotation of the axes, or a field that turns
+    with the vehicle other than hard iron.
+    """
+    free = try_lever_arm and "accelerometer" in model.rows
+    fit, response = _iterate(model, start, levels, 0, dip=free_dip, lever_arm=free, vps=vps)
+    for _ in range(BURST_ROUNDS):
+        passing = passing_fields(fit.model, fit.weight)
+        if not passing.any():
+            break
+        model = fit.model.without("magnetometer", passing)
+        fit, response = _iterate(model, fit.state, fit.levels, fit.iterations, dip=free_dip, lever_arm=free, vps=vps)
+    if not free:
+        return _enlarged(fit, response)
+    test = _lever_arm_test(fit)
+    if test >= LEVER_ARM_GATE:  # colour makes it smaller at most
+        fit = _enlarged(fit, response)
+        test = _lever_arm_test(fit)
+    if test < LEVER_ARM_GATE:
+        own = fit.layout["lever_arm"]
+        none = fit.covariance[:, own] @ np.linalg.solve(fit.covariance[own, own], fit.state.values["lever_arm"])
+        without = fit.state.moved(response @ none, -none, fit.layout)
+        without = replace(without, values={**without.values, "lever_arm": np.zeros(3)})
+        fit, response = _iterate(fit.model, without, fit.levels, fit.iterations, dip=free_dip, lever_arm=False, vps=vps)
+        fit = _enlarged(fit, response)
+    return replace(fit, lever_arm_test=test)
+
+
+def _lever_arm_test(fit: JointFit) -> float:
+    own, arm = fit.layout["lever_arm"], fit.state.values["lever_arm"]
+    return float(arm @ np.linalg.solve(fit.covariance[own, own], arm))
+
+
+def _enlarged(fit: JointFit, response: Array) -> JointFit:
+    """With the covariance that coloured residuals leave; `response` (K, s, p) of the knots to the parameters."""
+    chunks = sensitivities(fit.model, fit.state, fit.path, fit.layout, len(fit.information))
+    whitening = _whitening(fit.weight, fit.levels)
+    poses = None if fit.vps is None else fit.vps.whitened(fit.model, fit.state, fit.path, fit.layout, response)
+    knots = fit.model.knots
+    jumps = fit.path.jump, np.sqrt(knots.joined / (fit.levels.walk * knots.interval_s))
+    strength = fit.levels.strength
+    process = whitened_motion(knots, strength, response[:, 3:]), whitened_motion(knots, strength, fit.state.motion)
+    own = covariance(fit.model, chunks, response, fit.information, whitening, jumps, process, poses)
+    # The bias is the record's mean; its own walk takes it away from that to either end.
+    rate = body_jumps(fit.state, fit.path) / knots.interval_s[:, None]
+    walk = bias_walk(rate, knots.interval_s, knots.joined)
+    bias = np.arange(3, 6) + fit.layout["gyroscope"].start
+    own[bias, bias] += walk**2 * (fit.model.readings.t[-1] - fit.model.readings.t[0]) / 3.0
+    return replace(fit, covariance=own, bias_walk=walk)
+
+
+def _iterate(
+    model: Model, state: State, levels: Levels | None, spent: int, *, dip: bool, lever_arm: bool, vps: VpsRecord | None
+) -> tuple[JointFit, Array]:
+    """Gauss–Newton with noise levels renewed at every step: the fit with the inverse information as covariance, and the
+    knots' response N_xx⁻¹N_xθ. `spent` iterations came before."""
+    layout, p = layout_of(model, state.values, dip=dip, lever_arm=lever_arm)
+    knots, prior = model.knots, _Prior.at(model, state, layout, p)
+    probe = Probe.draw(knots, model.readings.t, model.at, 3 * len(model.rows))
+    path = trajectory(model, state)
+    residual = residuals(model, state, path)
+    levels = levels or first_levels(model, state, path, residual)
+    before: Array = np.zeros(p)
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        if iteration == ASTRAY:
+            state = initialise.anew(model, state)
+            path = trajectory(model, state)
+            residual = residuals(model, state, path)
+            levels, before = first_levels(model, state, path, residual), np.zeros(p)
+        weight = robust_weight(model, residual, levels)
+        normal, joints, reaction = linearised(model, state, path, layout, p, weight, levels, probe, vps)
+        prior.add(normal, state, layout)
+        eliminated, information, gradient = normal.eliminate()
+        own = layout["gyroscope"].start + np.arange(3)
+        gradient[own, GRADIENT] += logged_units(model, state, path, levels.walk)
+        within = levels.walk * within_intervals(model, state, layout, reaction, eliminated[:, :, p + BRIDGE])
+        gradient[:, GRADIENT] += within
+        theta = solve_scaled(information, gradient)
+        response = eliminated[:, :, p:] - eliminated[:, :, :p] @ theta
+        step, change = response[:, :, GRADIENT], theta[:, GRADIENT]
+        least = _least_part(state, step, change, layout)
+        if change @ information @ before < -TOO_FAR * (before @ information @ before):
+            least *= TOO_FAR
+        before = least * change
+        state = state.moved(least * step, least * change, layout)
+        path = trajectory(model, state)
+        residual = residuals(model, state, path)
+        if not np.isfinite(residual).all():
+            break
+        own_knots, own_theta = (x[..., : residual.shape[1]] for x in (reaction[0], reaction[1][:p]))
+        absorbed = np.einsum("kcr,kc->r", own_knots, response[:, SENSED, SENSORS]) + own_theta.T @ theta[:, SENSORS]
+        joints = replace(joints, jump=path.jump, motion=state.motion)
+        squares = joint_squares(knots, joints, response, theta, probe)
+        renewed = renewed_levels(model, residual, levels, absorbed, squares, gyro_walk(model, state))
+        unsettled, levels = unsettled_by(levels, renewed, squares), renewed
+        claimed = 1.0 / np.sqrt(np.diagonal(information))
+        settled = max(unsettled, float(np.max(np.abs(change) / claimed))) < SETTLED
+        if settled or float(np.max(np.abs(change))) < ROUNDING:
+            plain = inverse_information(information)
+            fit = JointFit(model, state, path, levels, weight, layout, plain, information, spent + iteration, vps=vps)
+            return fit, eliminated[:, :, :p]
+    raise _no_minimum(model, iteration)
+
+
+def _no_minimum(model: Model, iterations: int) -> EstimationError:
+    """Why there is none: axes that show hardly anything but noise, if there are such, or else the readings."""
+    still = [
+        f"{name} {'xyz'[axis]}"
+        for name, triad in model.triads.items()
+        for axis in np.flatnonzero(white_noise_sigma(triad.x[triad.known]) > STILL)
+    ]
+    if still:
+        return EstimationError(
+            "axis_not_turned",
+            f"The joint estimate found no minimum: {', '.join(still)} read hardly more than noise. Add 60° either way"
+            " about every axis.",
+            {"iterations": iterations, "still": still},
+        )
+    return EstimationError(
+        "joint_diverged",
+        "The joint estimate found no minimum: the readings contradict each other or the start is too far off.",
+        {"iterations": iterations},
+    )
+
+
+def linearised(
+    model: Model,
+    state: State,
+    path: Trajectory,
+    layout: Mapping[str, slice],
+    p: int,
+    weight: Array,
+    levels: Levels,
+    probe: Probe,
+    vps: VpsRecord | None,
+) -> tuple[Normal, Joints, tuple[Array, Array]]:
+    """Normal equations of everything but the prior, the joints in them, and every row's own reaction to the probe."""
+    knots, rows = len(model.knots.index), 3 * len(model.rows)
+    normal = Normal.empty(knots, p, len(RIGHTS))
+    reaction = np.zeros((knots, len(SENSED), 2 * rows + 3)), np.zeros((p + 1, 2 * rows + 3))
+    moved = np.zeros((knots, 3, p))  # ∂(integrated attitude)/∂θ
+    whitening = _whitening(weight, levels)
+    chunk: Rows
+    for ties, chunk, ends in sensitivities(model, state, path, layout, p):
+        accumulate(normal, model, chunk, ties, whitening[chunk.own], probe, reaction)
+        moved[ties] = ends
+    joints = Joints(path.jump, moved[:-1], levels.walk, state.motion, levels.strength)
+    add_joints(normal, model.knots, joints, probe)
+    if vps is not None:
+        vps.add(normal, model, state, path, layout)
+    return normal, joints, reaction
+
+
+def _whitening(weight: Array, levels: Levels) -> Array:
+    """Robust weights over what low-frequency noise the rows carry, (m, r), 1/x²."""
+    return np.asarray(weight / (levels.variance * levels.colour))
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """Vague belief about constants, so that directions that the record does not show stay where they started."""
+
+    mean: Array
+    information: Array
+
+    @classmethod
+    def at(cls, model: Model, state: State, layout: Mapping[str, slice], p: int) -> _Prior:
+        mean, sd = np.zeros(p), np.full(p, VAGUE)
+        for name, own in layout.items():
+            mean[own] = state.values[name]
+            if name in model.triads:
+                sd[own] = PRIOR_RELATIVE_SD * np.tile(np.abs(state.values[name][:3]), 2)
+        if "lever_arm" in layout:
+            mean[layout["lever_arm"]] = 0.0
+        return cls(mean, 1.0 / sd**2)
+
+    def add(self, normal: Normal, state: State, layout: Mapping[str, slice]) -> None:
+        now = np.concatenate([state.values[name] for name in layout])
+        normal.parameters[np.diag_indices(len(now))] += self.information
+        normal.parameters_right[:, 0] += self.information * (self.mean - now)
+
+
+def _least_part(state: State, step: Array, theta: Array, layout: Mapping[str, slice]) -> float:
+    """Part of a step that may be taken: no attitude by more than LARGEST_TURN_RAD, no scale by LARGEST_RELATIVE."""
+    longest = [float(np.max(np.abs(step[:, :3]))) / LARGEST_TURN_RAD]
+    for name, own in layout.items():
+        if name in TRIADS:
+            scale = np.abs(state.values[name][:3])
+            longest.append(float(np.max(np.abs(theta[own][:3]) / scale)) / LARGEST_RELATIVE)
+    return 1.0 / max(1.0, *longest)

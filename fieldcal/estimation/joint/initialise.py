@@ -1,0 +1,209 @@
+"""Where the joint estimator starts: constants from whatever is known, attitudes from the vectors they give."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.signal import welch
+
+from fieldcal.errors import EstimationError, UnusableFlight
+from fieldcal.estimation import wahba
+from fieldcal.estimation.ellipsoid import fit_ellipsoid
+from fieldcal.estimation.gyroscope.equation_error import fit_equation_error
+from fieldcal.estimation.gyroscope.output_error import propagate_stretches
+from fieldcal.estimation.joint.chain_solver import STATES, place_knots
+from fieldcal.estimation.joint.problem import Model, Readings, State, averaging_side, stretches
+from fieldcal.estimation.smoothing import differentiate_samples, fill, lattice, smooth_samples
+from fieldcal.geometry.rotation import (
+    Array,
+    angle_between,
+    body_from_inertial,
+    continuous,
+    from_rotation_vector,
+    multiply,
+)
+
+SPACING_S = 0.08
+START_CUTOFF_HZ = 4.0
+# Low-passes (cut-off, Hz; reach on either side, s) of the vectors that the gyroscope carries: the longer, the less of
+# translation and passing magnets is left, and the more of what the gyroscope drifts.
+WINDOWS = ((0.2, 1.5), (0.07, 4.5), (0.02, 15.0))
+TRUST = 0.1  # relative; a field that far off its own mean has half the weight
+# Rates for the lever arm: their derivative's noise would shrink it (a regressor), so they end, within 0.8 Hz
+# (π/TURNING_SIDE_S), where turning no longer has OVER_NOISE times the density of noise, which is that of NOISE_HZ.
+OVER_NOISE, TURNING_SIDE_S, SPECTRUM_S = 10.0, 4.0, 8.0
+NOISE_HZ, TURNING_HZ = (5.0, 20.0), (0.5, 5.0)
+
+Constants = tuple[Array, Array]
+
+
+def low_passed(t: Array, segment: np.ndarray, x: Array, cutoff_hz: float, side_s: float) -> Array:
+    """Fixed-weight low-pass by contiguous segment."""
+    out = np.empty_like(x)
+    for a, b in stretches(segment):
+        out[a:b] = smooth_samples(t[a:b], x[a:b], cutoff_hz, side_s=side_s)
+    return out
+
+
+def turning(t: Array, segment: np.ndarray, gyroscope: Array) -> Array:
+    """Low-passed gyroscope and its derivative (2, n, 3), logged units: `Readings.turning`."""
+    low = low_passed(t, segment, gyroscope, _fastest_turning_hz(t, segment, gyroscope), TURNING_SIDE_S)
+    change = np.empty_like(low)
+    for a, b in stretches(segment):
+        change[a:b] = differentiate_samples(t[a:b], low[a:b])
+    return np.stack([low, change])
+
+
+def _fastest_turning_hz(t: Array, segment: np.ndarray, gyroscope: Array) -> float:
+    """Up to which frequency the longest stretch's spectrum stands out of the gyroscope's noise, axes taken together."""
+    a, b = max(stretches(segment), key=lambda own: own[1] - own[0])
+    index, interval_s = lattice(t[a:b])
+    x = fill(index, gyroscope[a:b])
+    frequency, density = welch(x, 1.0 / interval_s, nperseg=min(len(x), round(SPECTRUM_S / interval_s)), axis=0)
+    from_hz = min(NOISE_HZ[0], 0.5 * frequency[-1])
+    noise = np.median(density[(frequency >= from_hz) & (frequency <= max(NOISE_HZ[1], from_hz))], axis=0)
+    over = np.mean(density / np.maximum(noise, 1e-300), axis=1)
+    strongest = int(np.argmax(over * (frequency <= TURNING_HZ[1])))
+    lost = strongest + np.flatnonzero(over[strongest:] < OVER_NOISE)
+    return float(np.clip(frequency[max(lost[0] - 1, 0)] if len(lost) else np.inf, *TURNING_HZ))
+
+
+def start_of_triad(logged: Array, magnitude: float, polarity: Array) -> Constants | None:
+    """Ellipsoid constants good enough to start from: the refined fit, else an algebraic one."""
+    known = logged[np.isfinite(logged).all(axis=1)]
+    for method in ("robust", "li", "two_step", "tls"):
+        try:
+            fit = fit_ellipsoid(known, magnitude, method=method, polarity=polarity)
+        except (UnusableFlight, EstimationError, ValueError):
+            continue
+        return fit.scale_diagonal, fit.bias
+    return None
+
+
+def prepare(
+    readings: Readings, constants: Mapping[str, Constants | None], *, lever_arm: Array | None = None
+) -> tuple[Model, State]:
+    """Model and start of a record.
+
+    Parameters
+    ----------
+    readings : Readings
+    constants : sensor → (λ (3,), b (3,)) or None
+        Starts in logged units, sensor axes, polarity right. A vector triad without one is left out; the gyroscope's is
+        estimated from attitudes where both vectors have one.
+    lever_arm : (3,) array, optional
+        Known, m, sensor axes.
+
+    Raises
+    ------
+    UnusableFlight
+        `no_start`: no vector triad has a start, or the gyroscope has none and one vector alone cannot give it.
+    """
+    vectors = {name: constants.get(name) for name in ("accelerometer", "magnetometer")}
+    readings = Readings(**{**vars(readings), **{name: None for name, own in vectors.items() if own is None}})
+    q, gyro = _start_attitude(readings, vectors, constants.get("gyroscope"))
+    knots = place_knots(readings.t, readings.segment, SPACING_S)
+    rate = np.sqrt(np.mean(np.sum((gyro[0] * readings.turning[0] + gyro[1]) ** 2, axis=1)))
+    model = Model.of(readings, knots, side=averaging_side(readings, 3.0 * float(rate)))
+    values = {"dip": np.array([_dip(readings.field_ned)]), "lever_arm": np.zeros(3) if lever_arm is None else lever_arm}
+    for name, own in {**vectors, "gyroscope": gyro}.items():
+        if name in model.triads and own is not None:
+            values[name] = model.triads[name].scaled(*own)
+    return model, State(q[knots.index], np.zeros((len(knots.index), STATES - 3)), values)
+
+
+def anew(model: Model, state: State) -> State:
+    """The state with attitudes from the constants that it has, as if they had been the start's, and no translation: a
+    start whose constants were far off leaves some attitudes where a passing field or translation explains them."""
+    constants = {name: triad.logged(state.values[name]) for name, triad in model.triads.items()}
+    vectors = {name: constants.get(name) for name in ("accelerometer", "magnetometer")}
+    q, _ = _start_attitude(model.readings, vectors, constants["gyroscope"])
+    return State(q[model.knots.index], np.zeros_like(state.motion), state.values)
+
+
+def _dip(field_ned: Array) -> float:
+    return float(np.arctan2(field_ned[2], np.hypot(field_ned[0], field_ned[1])))
+
+
+def _start_attitude(
+    r: Readings, vectors: Mapping[str, Constants | None], gyro: Constants | None
+) -> tuple[Array, Constants]:
+    """Attitude of the sensor axes (n, 4) and gyroscope constants."""
+    sensed = {}
+    for name, own in vectors.items():
+        logged = r.accelerometer if name == "accelerometer" else r.magnetometer
+        if own is not None and logged is not None:
+            sensed[name] = _filled(r.t, logged) * own[0] + own[1]
+    if len(sensed) == 2 and gyro is None:
+        both = {name: low_passed(r.t, r.segment, own, START_CUTOFF_HZ, 0.5) for name, own in sensed.items()}
+        gyro = _gyro_from_attitude(r, continuous(_turned_to(r, both)))
+    if not sensed or gyro is None:
+        raise UnusableFlight(
+            "no_start",
+            "The joint estimate found no start: it needs a magnetometer or accelerometer with some constants, and with"
+            " one of them alone a gyroscope whose unit is known.",
+        )
+    relative = propagate_stretches(r.t, r.gyroscope * gyro[0] + gyro[1], r.segment)
+    r_nb = body_from_inertial(relative).transpose(0, 2, 1)
+    carried = {name: np.einsum("nij,nj->ni", r_nb, own) for name, own in sensed.items()}
+    offsets = [_turned_to(r, _means(r, carried, *window)) for window in WINDOWS]
+    wander = [_wander(r.t, offset, side_s) for offset, (_, side_s) in zip(offsets, WINDOWS, strict=True)]
+    return multiply(offsets[int(np.argmin(wander))], relative), gyro
+
+
+def _means(r: Readings, carried: Mapping[str, Array], cutoff_hz: float, side_s: float) -> dict[str, Array]:
+    """Vectors in the axes that the gyroscope carries, low-passed. Translation averages out; a magnet does not, so that
+    a field far off its mean counts less."""
+    out = {name: low_passed(r.t, r.segment, x, cutoff_hz, side_s) for name, x in carried.items()}
+    if "magnetometer" in carried:
+        field, mean = carried["magnetometer"], out["magnetometer"]
+        limit = TRUST * np.linalg.norm(r.field_ned)
+        trust = 1.0 / (1.0 + np.sum(((field - mean) / limit) ** 2, axis=1, keepdims=True))
+        weighted = low_passed(r.t, r.segment, np.hstack([field * trust, trust]), cutoff_hz, side_s)
+        out["magnetometer"] = weighted[:, :3] / np.maximum(weighted[:, 3:], 1e-3)
+    return out
+
+
+def _turned_to(r: Readings, vectors: Mapping[str, Array]) -> Array:
+    """Attitudes (n, 4) of axes in which `vectors` (n, 3) are seen; with one of them the shortest turn."""
+    down = np.array([0.0, 0.0, float(np.sign(r.gravity_mps2))])
+    if len(vectors) == 2:
+        both = np.stack([vectors["magnetometer"], vectors["accelerometer"]], axis=1)
+        heading = float(np.arctan2(r.field_ned[1], r.field_ned[0]))
+        reference = np.array([r.field_ned, down])
+        return wahba.attitudes(both, reference, np.array([0.02, 0.02]), declination=heading).q
+    ((name, vector),) = vectors.items()
+    seen = vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)
+    true = r.field_ned / np.linalg.norm(r.field_ned) if name == "magnetometer" else down
+    axis = np.cross(seen, true)
+    sine = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, seen @ true)
+    return from_rotation_vector(axis * (angle / np.maximum(sine, 1e-12))[:, None])
+
+
+def _wander(t: Array, offset: Array, side_s: float) -> float:
+    """Rms angle, rad, between means that share no reading: what disturbs them and what the gyroscope drifts by."""
+    apart = int(2.0 * side_s / float(np.median(np.diff(t))))
+    if apart >= len(t):
+        return np.inf
+    return float(np.sqrt(np.mean(angle_between(offset[:-apart], offset[apart:]) ** 2)))
+
+
+def _filled(t: Array, x: Array) -> Array:
+    """Readings at every sample, linear between those there are."""
+    known = np.isfinite(x).all(axis=1)
+    return x if known.all() else np.column_stack([np.interp(t, t[known], c[known]) for c in x.T])
+
+
+def _gyro_from_attitude(r: Readings, q: Array) -> Constants:
+    """Equation error on the start's attitudes, both sides low-passed alike."""
+    logged = low_passed(r.t, r.segment, r.gyroscope, START_CUTOFF_HZ, 0.5)
+    q_dot = np.empty_like(q)
+    for a, b in stretches(r.segment):
+        q_dot[a:b] = differentiate_samples(r.t[a:b], q[a:b], window_s=0.05)
+    try:
+        fit = fit_equation_error(q, q_dot, logged)
+    except UnusableFlight as error:
+        raise UnusableFlight("no_start", f"The joint estimate found no start for the gyroscope: {error}") from error
+    return fit.scale, fit.bias

@@ -1,0 +1,220 @@
+"""Optional terms of the joint estimate, each let in only where it predicts held-out segments better.
+
+Cross-axis terms (a triad whose axes are not quite orthogonal or not quite the accelerometer's; soft iron), a delay of a
+vector triad behind the gyroscope, and the gyroscope's slope with temperature. On clean data each costs accuracy, so two
+gates stand before it: a score test on the whole record (cheap, no fit), and for those that pass, constants fitted on
+the first part of the record with and without the term, predicting the readings of the rest, where only attitude and
+translation are free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fieldcal.errors import EstimationError
+from fieldcal.estimation.joint.chain_solver import GRADIENT, Probe, place_knots, whitened_joints
+from fieldcal.estimation.joint.fit import JointFit, fit_joint, linearised
+from fieldcal.estimation.joint.measurement_model import layout_of, residuals, trajectory
+from fieldcal.estimation.joint.pose_measurement import PARAMETERS, VpsRecord
+from fieldcal.estimation.joint.problem import TERMS, Model, State
+from fieldcal.estimation.joint.variance_components import Levels, robust_weight
+from fieldcal.geometry.rotation import Array
+
+# Score test: χ² beyond this comes by chance once in a thousand, by degrees of freedom.
+SCORE_GATE = {1: 10.8, 3: 16.3, 6: 22.5}
+# Held-out gain over its standard deviation, from blocks of some seconds.
+GAIN_GATE, BLOCK_S, FEWEST_BLOCKS = 3.0, 2.0, 6
+FIT_SHARE = 0.6
+PREDICT_ITERATIONS, STEP_RAD = 10, 1e-6
+LEAST_WARMTH_DEGC = 1.0
+LEAST_RATE_RADPS = 0.2  # rms: below it a delay does nothing
+
+
+@dataclass(frozen=True)
+class TermTest:
+    """`score` χ² of the whole record; `gain` of the held-out likelihood over its sd, None where the score refused."""
+
+    name: str
+    score: float
+    gain: float | None
+    kept: bool
+
+
+def add_terms(fit: JointFit) -> tuple[JointFit, list[TermTest]]:
+    """The fit with those optional terms that it needs, and how each was judged."""
+    scores = _scores(fit)
+    over = {name: score / SCORE_GATE[TERMS[name]] for name, score in scores.items()}
+    tried = sorted((name for name in over if over[name] > 1.0), key=lambda name: -over[name])
+    gains = _gains(fit, tried) if tried else {}
+    kept = [name for name in tried if gains.get(name, -np.inf) > GAIN_GATE]
+    if kept:
+        try:
+            fit = with_terms(fit, kept)
+        except EstimationError:
+            kept = []
+    return fit, [TermTest(name, score, gains.get(name), name in kept) for name, score in scores.items()]
+
+
+def with_terms(fit: JointFit, names: list[str]) -> JointFit:
+    """The same record with these terms free. Raises EstimationError."""
+    own = _refitted(fit.model, fit.state, fit.levels, fit, names, fit.vps)
+    return replace(own, iterations=fit.iterations + own.iterations)
+
+
+def candidates(fit: JointFit) -> list[str]:
+    """Terms that this record could show at all."""
+    readings = fit.model.readings
+    out = ["gyroscope_cross"] if len(fit.model.rows) == 2 or fit.vps is not None else []
+    if readings.warmth is not None and float(np.ptp(readings.warmth)) > LEAST_WARMTH_DEGC:
+        out.append("gyroscope_temperature")
+    if float(np.sqrt(np.mean(np.sum(fit.path.rate**2, axis=1)))) > LEAST_RATE_RADPS:
+        out += [f"{name}_delay" for name in fit.model.rows]
+    return out + [f"{name}_cross" for name in fit.model.rows]
+
+
+def with_zeros(state: State, names: list[str]) -> State:
+    """The state with these terms free, at nothing."""
+    return replace(state, values={**state.values, **{name: np.zeros(TERMS[name]) for name in names}})
+
+
+def _refitted(
+    model: Model, state: State, levels: Levels, like: JointFit, names: list[str], vps: VpsRecord | None
+) -> JointFit:
+    free = {"free_dip": "dip" in like.layout, "try_lever_arm": "lever_arm" in like.layout}
+    return fit_joint(model, with_zeros(state, names), vps=vps, levels=levels, **free)
+
+
+def _scores(fit: JointFit) -> dict[str, float]:
+    """χ² of each candidate's first step, all of them free and the rest following; the fit is at its optimum."""
+    names = candidates(fit)
+    model, state = fit.model, with_zeros(fit.state, names)
+    layout, p = layout_of(model, state.values, dip="dip" in fit.layout, lever_arm="lever_arm" in fit.layout)
+    probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.rows))
+    normal, _, _ = linearised(model, state, fit.path, layout, p, fit.weight, fit.levels, probe, fit.vps)
+    _, information, gradient = normal.eliminate()
+    own = np.concatenate([np.arange(p)[layout[name]] for name in names])
+    rest = np.setdiff1d(np.arange(p), own)
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
+    unit = information * np.outer(scale, scale)
+    left = (
+        unit[np.ix_(own, own)]
+        - unit[np.ix_(own, rest)] @ np.linalg.lstsq(unit[np.ix_(rest, rest)], unit[np.ix_(rest, own)], rcond=1e-10)[0]
+    )
+    covariance = np.linalg.pinv(left, rcond=1e-6, hermitian=True)
+    step = covariance @ (gradient[own, GRADIENT] * scale[own])
+    out, at = {}, 0
+    for name in names:
+        these = slice(at, at + TERMS[name])
+        out[name] = float(step[these] @ np.linalg.lstsq(covariance[these, these], step[these], rcond=1e-10)[0])
+        at = these.stop
+    return out
+
+
+def _gains(fit: JointFit, names: list[str]) -> dict[str, float]:
+    """Forward selection on the first part of the record, judged by the rest: gain over its sd of each term when it was
+    its turn."""
+    n = len(fit.model.readings.t)
+    split = int(fit.model.knots.index[np.searchsorted(fit.model.knots.index, int(FIT_SHARE * n))])
+    early, late = (_part(fit, a, b) for a, b in ((0, split + 1), (split, n)))
+    out: dict[str, float] = {}
+    try:
+        current = _refitted(*early[:2], fit.levels, fit, [], early[2])
+        without = _predicted(*late, current, current)
+        for name in names:
+            other = _refitted(early[0], current.state, current.levels, fit, [name], early[2])
+            out[name] = _gain(late[0], without, _predicted(*late, other, current))
+            if out[name] > GAIN_GATE:
+                current, without = other, _predicted(*late, other, other)
+    except EstimationError:
+        pass
+    return out
+
+
+def _part(fit: JointFit, a: int, b: int) -> tuple[Model, State, VpsRecord | None]:
+    """Samples a to b of the fitted record, its attitudes and translation as the start."""
+    readings, old = fit.model.readings, fit.model.knots
+    spacing = float(np.max(old.interval_s[old.joined]))
+    knots = place_knots(readings.t[a:b], readings.segment[a:b], spacing * 1.001)
+    model = fit.model.part(a, b, knots)
+    at = a + knots.index
+    state = replace(fit.state, q=fit.path.q[at], motion=fit.state.motion[old.of_sample[at]])
+    if fit.vps is None:
+        return model, state, None
+    vps = fit.vps.at_knots(model, state, trajectory(model, state))
+    # The record's constant rotations are found anew.
+    return model, replace(state, values={**state.values, **fit.vps.start()}), vps
+
+
+@dataclass(frozen=True)
+class _Prediction:
+    """Residuals over their sd: of readings (m, r) with robust weights, and of what ties the knots (K−1, c)."""
+
+    rows: Array
+    weight: Array
+    ties: Array
+
+
+def _predicted(model: Model, state: State, vps: VpsRecord | None, constants: JointFit, noise: JointFit) -> _Prediction:
+    """Under the constants of one fit and the noise levels of another; attitudes and translation are free."""
+    levels = noise.levels
+    state = replace(state, values=constants.state.values)
+    reference = None
+    if vps is not None and constants.vps is not None and noise.vps is not None:
+        sigma = noise.vps.sigma(noise.model, noise.state)
+        reference = replace(constants.vps, used=vps.used, sigma_rad=sigma)
+    own = {name: v for name, v in state.values.items() if name in TERMS or name in PARAMETERS}
+    layout, p = layout_of(model, own, dip=False, lever_arm=False)
+    probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.rows))
+    for _ in range(PREDICT_ITERATIONS):
+        path = trajectory(model, state)
+        weight = robust_weight(model, residuals(model, state, path), levels)
+        normal, joints, _ = linearised(model, state, path, layout, p, weight, levels, probe, reference)
+        step = normal.eliminate()[0][:, :, p + GRADIENT]
+        state = state.moved(step, np.zeros(p), layout)
+        if np.max(np.abs(step[:, :3])) < STEP_RAD:
+            break
+    path = trajectory(model, state)
+    residual = residuals(model, state, path)
+    ties = whitened_joints(model.knots, replace(joints, jump=path.jump, motion=state.motion))
+    if reference is not None:
+        error, known = reference.residual(model, state)
+        ties = np.hstack([ties, (error * known[:, None] / reference.sigma_rad)[:-1]])
+    return _Prediction(
+        residual / np.sqrt(levels.variance * levels.colour), robust_weight(model, residual, levels), ties
+    )
+
+
+def _gain(model: Model, without: _Prediction, term: _Prediction) -> float:
+    """Drop of the squares d over its sd. Where the term is right d is |Δ|² + 2Δᵀe with Δ the change of the residuals
+    and e noise, so d − |Δ|² summed by blocks of BLOCK_S, longer than the noise remembers, gives the sd."""
+    knots = model.knots
+    blocks = max(1, round(float(knots.interval_s.sum()) / BLOCK_S))
+    if blocks < FEWEST_BLOCKS:
+        return 0.0
+    of_knot = np.minimum(np.arange(len(knots.index)) * blocks // len(knots.index), blocks - 1)
+    drop, changed = np.zeros(blocks), np.zeros(blocks)
+    for a, b, weight, block in (
+        (without.rows, term.rows, without.weight, of_knot[knots.of_sample[model.at]]),
+        (without.ties, term.ties, np.ones_like(without.ties), of_knot[:-1]),
+    ):
+        drop += np.bincount(block, np.sum(weight * (a**2 - b**2), axis=1), minlength=blocks)
+        changed += np.bincount(block, np.sum(weight * (a - b) ** 2, axis=1), minlength=blocks)
+    sd = float(np.sqrt(np.sum((drop - changed) ** 2)))
+    return float(drop.sum()) / sd if sd > 0.0 else 0.0
+
+
+def told(tests: list[TermTest], fit: JointFit) -> Mapping[str, dict[str, object]]:
+    """Plain numbers for `measured`: how each was judged and, where kept, its values and sd."""
+    out: dict[str, dict[str, object]] = {}
+    for test in tests:
+        out[test.name] = {"kept": test.kept, "score": test.score, "held_out_gain": test.gain}
+        if test.kept:
+            own = fit.layout[test.name]
+            out[test.name] |= {
+                "value": fit.state.values[test.name].tolist(),
+                "sd": np.sqrt(np.diagonal(fit.covariance)[own]).tolist(),
+            }
+    return out

@@ -1,0 +1,176 @@
+"""`fieldcal apply`: a log's readings through the constants its vehicle flies with, as Parquet or MCAP. The log is only
+read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal.config.find import CONFIG_NAME, configuration_of, find_source
+from fieldcal.errors import FieldcalError
+from fieldcal.exports.calibration import SENSORS, Constants, Triad
+from fieldcal.exports.calibration_at import constants_of
+from fieldcal.geometry import sensor_model
+from fieldcal.geometry.earth_field import UNIT_IN_TESLA
+from fieldcal.geometry.rotation import FRD_FROM_FLU, Array
+from fieldcal.logs import ingest
+from fieldcal.logs.mcap.write import imu_channel, magnetic_field_channel, temperature_channel, write_mcap
+from fieldcal.stages.tables import columns_of, matrix, triad
+from fieldcal.warehouse.errors import disk
+from fieldcal.warehouse.store import TableWriter
+
+TABLE_OF = {"gyroscope": "imu", "accelerometer": "imu", "magnetometer": "magnetometer"}
+FLU_FROM_FRD = FRD_FROM_FLU.T
+SPECIFIC_FORCE = {"gravity": -1.0, "specific_force": 1.0}
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """Readings z of a log, sensor → (stamps ns, (n, 3) in the sensor axes as logged), and what was known for them."""
+
+    readings: dict[str, tuple[np.ndarray, Array]]
+    temperature: pl.DataFrame | None
+    settings: dict[str, Any]
+    constants: Constants
+    warnings: tuple[str, ...]
+
+
+def apply_constants(
+    log: Path, root: Path, config: Path | None, vehicle_id: str | None, temperature_degc: float | None
+) -> Calibrated:
+    """Read a log and calibrate it: at `temperature_degc`, or at each sample's own where the log has temperatures.
+
+    Raises
+    ------
+    FieldcalError
+        `not_found`; `no_calibration`; `unit_mismatch`: the log's readings are in another unit than the constants;
+        `not_usable`: nothing can be read.
+    """
+    log = log.absolute()
+    if not log.exists():
+        raise FieldcalError("not_found", f"There is no log at {log}.")
+    own = log.parent.parent.parent / CONFIG_NAME
+    vehicle = configuration_of(find_source(config or (own if own.is_file() else None), None)).vehicle(
+        vehicle_id or log.parent.parent.name
+    )
+    constants = constants_of(root, vehicle.vehicle_id, temperature_degc)
+    signals, facts = ingest.read_flight(log, vehicle)
+    if facts["verdict"] not in ("ok", "partial"):
+        raise FieldcalError("not_usable", f"{log.name}: {facts['reason']}")
+    settings = ingest.settings_of(facts, vehicle)
+    temperature = signals.get("temperature") if temperature_degc is None else None
+    readings, warnings = {}, []
+    for name in SENSORS:
+        table = signals.get(TABLE_OF[name])
+        if table is None or table.is_empty() or table[f"{name}_x"].null_count() == table.height:
+            continue
+        constant = constants.triads.get(name)
+        if constant is None:
+            warnings.append(f"{name}: no constants, so it is left out.")
+            continue
+        if constant.logged_unit != settings["units"][name]:
+            raise FieldcalError(
+                "unit_mismatch",
+                f"{log.name}: the {name} is in {settings['units'][name]}, the constants are for {constant.logged_unit};"
+                " give the vehicle whose log this is (--vehicle), or its units in fieldcal.toml.",
+            )
+        t_ns = table["t_ns"].to_numpy()
+        readings[name] = t_ns, constant.apply(matrix(table, triad(name)), _temperature_at(t_ns, temperature))
+        warnings += _outside(name, constant, temperature)
+    if not readings:
+        raise FieldcalError("no_calibration", f"{log.name}: no sensor of this log has constants.")
+    return Calibrated(readings, signals.get("temperature"), settings, constants, tuple(warnings))
+
+
+def write_parquet(c: Calibrated, folder: Path) -> list[Path]:
+    """imu.parquet and magnetometer.parquet: the signal tables with calibrated values, in the sensor axes as logged."""
+    with disk(folder, "made"):
+        folder.mkdir(parents=True, exist_ok=True)
+    metadata = {
+        "calibrated": "z = scale * logged + bias, sensor axes as logged, gravity sign as declared",
+        "vehicle_id": c.constants.vehicle_id,
+        "imu_id": c.constants.imu_id,
+        "constants_as_of": c.constants.as_of,
+        "gravity_sign": c.settings["gravity_sign"],
+    }
+    units = {name: c.constants.triads[name].unit for name in c.readings}
+    written = []
+    for table in ("imu", "magnetometer"):
+        own = [name for name in c.readings if TABLE_OF[name] == table]
+        if not own:
+            continue
+        t_ns = c.readings[own[0]][0]
+        columns = {"t_ns": t_ns}
+        for name in SENSORS:
+            if TABLE_OF[name] == table:
+                values = c.readings[name][1] if name in own else np.full((len(t_ns), 3), np.nan)
+                columns |= columns_of(values, triad(name))
+        path = folder / f"{table}.parquet"
+        frame = pl.DataFrame(columns).with_columns(pl.col(pl.Float64).fill_nan(None))
+        with TableWriter(table, path, units=units, metadata=metadata) as writer:
+            writer.write(frame)
+        written.append(path)
+    return written
+
+
+def write_ros(c: Calibrated, path: Path) -> tuple[str, ...]:
+    """One MCAP of `sensor_msgs/Imu` and `MagneticField` by REP-103 and 145: body axes forward, left, up; specific
+    force; rad/s, m/s² and tesla. What it cannot say is returned."""
+    body = FLU_FROM_FRD @ sensor_model.frd_from_sensor(c.settings["rotation_body_from_sensor"], c.settings["body"])
+    channels, warnings = [], []
+    gyroscope, accelerometer = c.readings.get("gyroscope"), c.readings.get("accelerometer")
+    either = gyroscope or accelerometer
+    if either is not None:
+        nothing = np.full((len(either[0]), 3), np.nan)
+        sign = SPECIFIC_FORCE[c.settings["gravity_sign"]]
+        rate = nothing if gyroscope is None else gyroscope[1] @ body.T
+        force = nothing if accelerometer is None else sign * accelerometer[1] @ body.T
+        channels.append(imu_channel(either[0], None, rate, force, topic="/imu/data", frame_id="base_link"))
+    if (magnetometer := c.readings.get("magnetometer")) is not None:
+        unit = c.constants.triads["magnetometer"].unit
+        factor, topic = UNIT_IN_TESLA.get(unit), "/imu/mag"
+        if factor is None:
+            factor, topic = 1.0, "/imu/mag_norm"
+            warnings.append(
+                f"magnetometer: in units of the local field, whose strength is not configured; {topic} is not in tesla."
+            )
+        field = factor * magnetometer[1] @ body.T
+        channels.append(magnetic_field_channel(magnetometer[0], None, field, topic=topic, frame_id="base_link"))
+    if c.temperature is not None and not c.temperature.is_empty():
+        t_ns, warm = c.temperature["t_ns"].to_numpy(), c.temperature["temperature_degc"].to_numpy()
+        channels.append(temperature_channel(t_ns, None, warm, frame_id="base_link"))
+    with disk(path, "written"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_name(path.name + ".part")
+        write_mcap(unfinished, channels, metadata={"body": "flu", "gravity_sign": "specific_force"})
+        unfinished.replace(path)
+    return tuple(warnings)
+
+
+def _temperature_at(t_ns: np.ndarray, temperature: pl.DataFrame | None) -> Array | None:
+    if temperature is None or temperature.is_empty():
+        return None
+    known = temperature.filter(pl.col("temperature_degc").is_finite())
+    if known.is_empty():
+        return None
+    origin = int(known["t_ns"][0])
+    seconds = (t_ns - origin) * 1e-9
+    return np.interp(seconds, (known["t_ns"].to_numpy() - origin) * 1e-9, known["temperature_degc"].to_numpy())
+
+
+def _outside(name: str, constant: Triad, temperature: pl.DataFrame | None) -> list[str]:
+    """A warning where the log is colder or warmer than what the slopes were found on."""
+    if temperature is None or constant.flown_degc is None or temperature.is_empty():
+        return []
+    known = temperature["temperature_degc"].drop_nulls().to_numpy()
+    if len(known) == 0 or (known.min() >= constant.flown_degc[0] and known.max() <= constant.flown_degc[1]):
+        return []
+    low, high = known.min(), known.max()
+    return [
+        f"{name}: {low:.1f} to {high:.1f} °C goes beyond the {constant.flown_degc[0]:.1f} to"
+        f" {constant.flown_degc[1]:.1f} °C flown."
+    ]

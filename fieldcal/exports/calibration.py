@@ -1,0 +1,88 @@
+"""The constants an aircraft flies with, and what they make of readings: the model that every export is a form of.
+
+    z = Λ(T) (z_d − zero(T)),  Λ(T) = Λ + Λ' d,  zero(T) = zero + zero₁ d + zero₂ d² + zero₃ d³,  d = T − T0
+
+Eq. 5 with its offset in logged units: autopilots subtract before they scale, and `zero` keeps a counts log's digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fieldcal.geometry.rotation import Array
+
+SENSORS = ("gyroscope", "accelerometer", "magnetometer")
+
+
+def cubic_about(first: Array, second: Array, third: Array, by_degc: float) -> tuple[Array, Array, Array]:
+    """Coefficients of d, d² and d³ of a cubic that had these about a point `by_degc` below: c(d + by) − c(by)."""
+    return first + 2.0 * second * by_degc + 3.0 * third * by_degc**2, second + 3.0 * third * by_degc, third
+
+
+@dataclass(frozen=True)
+class Triad:
+    """Constants of one triad at `temperature_degc` T0, sensor axes as logged.
+
+    `scale` (3, 3) in `unit` per `logged_unit`, `zero` (3,) in `logged_unit`, their slopes per °C (0 where unknown), the
+    zero's bend per °C² and °C³ (0 where none is known),
+    sd of the diagonal and of zero (3,). `flown_degc`: lowest and highest temperature of the history, None without a
+    slope. `why`: where the numbers come from.
+    """
+
+    scale: Array
+    zero: Array
+    scale_per_degc: Array
+    zero_per_degc: Array
+    scale_sd: Array
+    zero_sd: Array
+    unit: str
+    logged_unit: str
+    temperature_degc: float
+    flown_degc: tuple[float, float] | None
+    why: tuple[str, ...]
+    zero_per_degc2: Array = field(default_factory=lambda: np.zeros(3))
+    zero_per_degc3: Array = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def diagonal(self) -> bool:
+        """Whether the axes are independent: no soft iron, no cross-axis terms."""
+        return bool(np.array_equal(self.scale, np.diag(np.diagonal(self.scale))))
+
+    def apply(self, logged: ArrayLike, temperature_degc: ArrayLike | None = None) -> Array:
+        """z (n, 3) from readings (n, 3), at T0 or at a temperature (n,) for each; where it is NaN at T0."""
+        z = np.asarray(logged, dtype=float)
+        if temperature_degc is None:
+            return np.asarray((z - self.zero) @ self.scale.T)
+        warmer = np.asarray(temperature_degc, dtype=float) - self.temperature_degc
+        warmer = np.where(np.isfinite(warmer), warmer, 0.0)[:, None]
+        bend = self.zero_per_degc2 + warmer * self.zero_per_degc3
+        off = z - self.zero - warmer * (self.zero_per_degc + warmer * bend)
+        return np.asarray(off @ self.scale.T + warmer * (off @ self.scale_per_degc.T))
+
+
+@dataclass(frozen=True)
+class Constants:
+    """What a vehicle flies with: sensor → triad, and who and when."""
+
+    vehicle_id: str
+    imu_id: str
+    triads: Mapping[str, Triad]
+    as_of: str
+    """ISO 8601 of the latest flight that they come from; empty when its clock is unknown."""
+
+    @property
+    def heading(self) -> str:
+        """Who and when, on one line whatever the ids are."""
+        return " ".join(f"fieldcal: {self.vehicle_id}, IMU {self.imu_id}, as of {self.as_of or 'unknown'}".split())
+
+
+@dataclass(frozen=True)
+class Export:
+    """A text in somebody else's format, and what that format cannot hold."""
+
+    text: str
+    warnings: tuple[str, ...]

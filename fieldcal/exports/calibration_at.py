@@ -1,0 +1,109 @@
+"""What a vehicle flies with, from the warehouse: `calibration_at` a temperature as constants of three triads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal.errors import FieldcalError
+from fieldcal.exports.calibration import SENSORS, Constants, Triad, cubic_about
+from fieldcal.stages.tables import AXES
+from fieldcal.warehouse.questions import existing
+
+REFERENCE_DEGC = 25.0
+_QUESTION = """
+SELECT a.*, l.slope_per_degc, l.curve_per_degc2, l.curve_per_degc3, l.temperature_min_degc, l.temperature_max_degc
+FROM calibration_at(?) AS a
+JOIN latest_calibration AS l USING (imu_id, sensor, parameter, axis)
+WHERE a.vehicle_id = ? AND a.parameter IN ('scale', 'zero')
+"""
+
+
+def constants_of(root: Path, vehicle_id: str, temperature_degc: float | None = None) -> Constants:
+    """Constants at a temperature (default 25 °C) of the IMU that flew last on the vehicle.
+
+    Scale and zero are what is looked up: the two hardly depend on each other, and the offset follows from both.
+
+    Raises
+    ------
+    FieldcalError
+        `no_calibration`: no sensor of the vehicle has all its axes calibrated, or the vehicle is not known.
+    """
+    at = REFERENCE_DEGC if temperature_degc is None else float(temperature_degc)
+    warehouse = existing(root)
+    rows = warehouse.sql(_QUESTION, [at, vehicle_id])
+    if rows.is_empty():
+        known = warehouse.scan("calibration").select("vehicle_id").unique().sort("vehicle_id").collect()["vehicle_id"]
+        there = ", ".join(known.head(20).to_list()) or "none"
+        raise FieldcalError("no_calibration", f"No calibration of vehicle {vehicle_id!r} is known; there is: {there}.")
+    last = rows.sort("started_at", "flight_id", nulls_last=False).row(-1, named=True)
+    rows = rows.filter(pl.col("imu_id") == last["imu_id"])
+    triads = {s: triad for s in SENSORS if (triad := _triad(rows.filter(sensor=s), at)) is not None}
+    if not triads:
+        raise FieldcalError(
+            "no_calibration",
+            f'No sensor of {vehicle_id!r} has all its axes calibrated; `fieldcal sql "FROM refusals"` says why.',
+        )
+    as_of = "" if last["started_at"] is None else last["started_at"].isoformat()
+    return Constants(vehicle_id, str(last["imu_id"]), triads, as_of)
+
+
+def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
+    """One sensor's constants; None unless every axis has both scale and zero."""
+    found = {(row["parameter"], row["axis"]): row for row in rows.iter_rows(named=True)}
+    if any((parameter, axis) not in found for parameter in ("scale", "zero") for axis in AXES):
+        return None
+    full = all(
+        (row := found.get(("scale", a + b))) is not None and row["flight_id"] == found["scale", a]["flight_id"]
+        for a in AXES
+        for b in AXES
+    )
+    names = [[a + b if full else a if a == b else "" for b in AXES] for a in AXES]
+
+    def matrix(column: str) -> np.ndarray:
+        return np.array([[_or_zero(found[("scale", n)][column]) if n else 0.0 for n in row] for row in names])
+
+    def vector(parameter: str, column: str, unknown: float = 0.0) -> np.ndarray:
+        values = [found[parameter, axis][column] for axis in AXES]
+        return np.array([unknown if v is None else v for v in values], dtype=float)
+
+    # The curve about 25 °C, brought to the temperature that is asked for.
+    first, second, third = (vector("zero", c) for c in ("slope_per_degc", "curve_per_degc2", "curve_per_degc3"))
+    slope, square, cube = cubic_about(first, second, third, at - REFERENCE_DEGC)
+    sloped = [row for row in found.values() if row["slope_per_degc"] is not None]
+    flown = (
+        (max(r["temperature_min_degc"] for r in sloped), min(r["temperature_max_degc"] for r in sloped))
+        if sloped
+        else None
+    )
+    return Triad(
+        scale=matrix("value"),
+        zero=vector("zero", "value"),
+        scale_per_degc=matrix("slope_per_degc"),
+        zero_per_degc=slope,
+        zero_per_degc2=square,
+        zero_per_degc3=cube,
+        scale_sd=vector("scale", "sd", np.nan),
+        zero_sd=vector("zero", "sd", np.nan),
+        unit=_calibrated_unit(found),
+        logged_unit=str(found["zero", "x"]["unit"]),
+        temperature_degc=at,
+        flown_degc=flown,
+        why=tuple(
+            f"{parameter} {axis}: {found[parameter, axis]['why']}" for parameter in ("scale", "zero") for axis in AXES
+        ),
+    )
+
+
+def _calibrated_unit(found: dict[tuple[str, str], dict[str, Any]]) -> str:
+    """Unit of the result: a scale's unit is it per logged unit, or "1" where both are the same."""
+    scale, logged = str(found["scale", "x"]["unit"]), str(found["zero", "x"]["unit"])
+    divisor = f"/({logged})" if "/" in logged else f"/{logged}"
+    return logged if scale == "1" else scale.removesuffix(divisor)
+
+
+def _or_zero(value: float | None) -> float:
+    return 0.0 if value is None else float(value)

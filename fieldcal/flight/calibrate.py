@@ -1,0 +1,129 @@
+"""`fieldcal calibrate`: one log through the whole pipeline in memory. No warehouse, no Prefect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from fieldcal.config.configuration import Configuration
+from fieldcal.config.find import CONFIG_NAME, configuration_of, find_source, with_parameters
+from fieldcal.errors import FieldcalError, unforeseen
+from fieldcal.flight.job import Job
+from fieldcal.flight.rows import flight_row, judged, lead, published_tables, rows_frame, run_rows
+from fieldcal.flight.threads import one_thread
+from fieldcal.flight.versions import versions
+from fieldcal.logs import flight_id, ingest, log_format, log_sha256
+from fieldcal.stages.pipeline import INGEST, PIPELINE, run_stage
+from fieldcal.stages.results import StageResult, plain
+from fieldcal.words.rows import rows_of, unfolded
+
+
+@dataclass(frozen=True)
+class CalibratedLog:
+    """One log's results: `document` as `calibrate_log` returns it, every `stage.table`, and the stages' settings."""
+
+    document: dict[str, Any]
+    tables: dict[str, pl.DataFrame]
+    settings: dict[str, Any]
+
+
+def calibrate_log(log: Path, config: Path | None = None, **choices: Any) -> dict[str, Any]:
+    """Calibrate one log; its flight, calibration, fit, sync and run, named as the columns of those tables. Arguments
+    and errors as in `run_log`."""
+    return run_log(log, config, **choices).document
+
+
+def run_log(
+    log: Path,
+    config: Path | None = None,
+    *,
+    vehicle_id: str | None = None,
+    session_id: str | None = None,
+    profile: str | None = None,
+    method: str | None = None,
+    changes: dict[str, str] | None = None,
+) -> CalibratedLog:
+    """Calibrate one log; what it says, and all tables on the way.
+
+    Vehicle and session are taken from the folders the log lies in, `<vehicle>/<session>/<log>`, unless given; the
+    configuration from `fieldcal.toml` above them, unless given. `profile`, `method` and `changes` overrule its own.
+
+    Raises
+    ------
+    ConfigurationError
+        The configuration or an override is wrong.
+    FieldcalError
+        `not_found`, `not_readable`: there is no such log.
+    """
+    log = log.absolute()
+    archive = log.parent.parent.parent
+    configuration = _configuration(config, archive)
+    vehicle_id = vehicle_id or log.parent.parent.name
+    job = _job(log, vehicle_id, session_id or log.parent.name, archive)
+    vehicle = with_parameters(configuration.vehicle(vehicle_id), profile, changes or {})
+    if method is not None:
+        vehicle = replace(vehicle, method=method)
+    signals, facts = ingest.read_flight(log, vehicle)
+    records: dict[str, dict[str, Any]] = {INGEST: _record(_ingest_result(facts))}
+    settings: dict[str, Any] = {}
+    tables: dict[str, pl.DataFrame] = {f"{INGEST}.{name}": frame for name, frame in signals.items()}
+    if facts["verdict"] in ("ok", "partial"):
+        settings = ingest.settings_of(facts, vehicle)
+        for stage in PIPELINE:
+            try:
+                with one_thread():
+                    result = run_stage(stage, tables, settings)
+            except Exception as error:
+                why = f"{stage.name}: {unforeseen(job.log_uri, error)}"
+                result = StageResult(status="failed", reason_code="stage_failed", reason=why)
+            records[stage.name] = _record(result)
+            tables |= {f"{stage.name}.{name}": frame for name, frame in result.tables.items()}
+    facts = judged(facts, records)
+    leading = lead(job, vehicle.imu_id, facts)
+    published = published_tables([(leading, {name: (frame, None) for name, frame in tables.items()})])
+    sync = rows_of(published["sync"])
+    document = {
+        "flight": unfolded(rows_of(rows_frame("flight", [flight_row(job, leading, facts)]))[0]),
+        "calibration": rows_of(published["calibration"]),
+        "fit": rows_of(published["fit"]),
+        "sync": sync[0] if sync else None,
+        "run": [unfolded(row) for row in rows_of(rows_frame("run", run_rows(leading, records)))],
+    }
+    return CalibratedLog(document, tables, settings)
+
+
+def _configuration(config: Path | None, archive: Path) -> Configuration:
+    """The named file, else `fieldcal.toml` at the archive's root."""
+    own = archive / CONFIG_NAME
+    return configuration_of(find_source(config or (own if own.is_file() else None), None))
+
+
+def _job(log: Path, vehicle_id: str, session_id: str, archive: Path) -> Job:
+    if not log.exists():
+        raise FieldcalError("not_found", f"There is no log at {log}.")
+    try:
+        sha256 = log_sha256(log)
+    except OSError as error:
+        raise FieldcalError("not_readable", f"{log} cannot be read ({error.strerror}).") from error
+    kind = log_format(log) or log.suffix.lstrip(".") or "unknown"
+    return Job(str(log), log.relative_to(archive).as_posix(), vehicle_id, session_id, kind, sha256, flight_id(sha256))
+
+
+def _ingest_result(facts: dict[str, Any]) -> StageResult:
+    status = "ok" if facts["verdict"] in ("ok", "partial") else "refused"
+    measured = {"rows": facts["rows"], "units": facts["units"], "verdict": facts["verdict"]}
+    return StageResult(status=status, reason_code=facts["reason_code"], reason=facts["reason"], measured=measured)
+
+
+def _record(result: StageResult) -> dict[str, Any]:
+    return {
+        "status": result.status,
+        "reason_code": result.reason_code,
+        "reason": result.reason,
+        "measured": plain(result.measured),
+        "versions": versions(),
+        "run_key": None,
+    }

@@ -1,0 +1,1 @@
+"""Rotations, the sensor model, the earth's magnetic field."""

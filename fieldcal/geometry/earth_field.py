@@ -1,0 +1,57 @@
+"""The local magnetic field: World Magnetic Model for a place and date, or what is configured."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from fieldcal.errors import ConfigurationError
+from fieldcal.geometry.rotation import Array
+
+UNIT_IN_TESLA = {"T": 1.0, "uT": 1e-6, "G": 1e-4}
+
+
+@lru_cache(maxsize=4)
+def _model(year: int) -> Any:
+    """The five-year model that covers a year."""
+    from pygeomag import GeoMag
+
+    epoch = min(2025, max(2010, year - year % 5))
+    return GeoMag(coefficients_file=f"wmm/WMM_{epoch}.COF")
+
+
+def world_magnetic_model(latitude_deg: float, longitude_deg: float, altitude_m: float, when: datetime) -> Array:
+    """Field (north, east, down), tesla, at a geodetic position and UTC date (WMM 2010 to 2025).
+
+    Raises
+    ------
+    ConfigurationError
+        `field_outside_model`: the date lies outside the model's validity, or the position is no position.
+    """
+    when = when.astimezone(UTC)
+    start = datetime(when.year, 1, 1, tzinfo=UTC)
+    length = (datetime(when.year + 1, 1, 1, tzinfo=UTC) - start).total_seconds()
+    year = when.year + (when - start).total_seconds() / length
+    if not (-90 <= latitude_deg <= 90 and -180 <= longitude_deg <= 360):
+        raise ConfigurationError(
+            "field_outside_model", f"latitude {latitude_deg}, longitude {longitude_deg} is no position on the Earth."
+        )
+    try:
+        result = _model(when.year).calculate(glat=latitude_deg, glon=longitude_deg, alt=altitude_m / 1000.0, time=year)
+    except ValueError as error:
+        raise ConfigurationError(
+            "field_outside_model",
+            f"The World Magnetic Model does not cover {when.date()}: configure"
+            f" field.north_east_down instead ({error}).",
+        ) from error
+    return np.array([result.x, result.y, result.z]) * 1e-9
+
+
+def in_unit(field_tesla: Array, unit: str) -> Array:
+    """A field in tesla in the unit asked for; "norm" makes it a unit vector."""
+    if unit == "norm":
+        return np.asarray(field_tesla / np.linalg.norm(field_tesla))
+    return np.asarray(field_tesla / UNIT_IN_TESLA[unit])

@@ -1,0 +1,99 @@
+"""Which columns of a CSV file hold what: configured names, or the default ones."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from fieldcal.errors import UnreadableLog
+from fieldcal.logs.csv.dialect import Dialect
+from fieldcal.logs.csv.units import sensor_unit
+from fieldcal.logs.interface import LogSummary
+
+IMU_DEFAULTS: dict[str, tuple[str, ...]] = {
+    "gyroscope": ("gx", "gy", "gz"),
+    "accelerometer": ("ax", "ay", "az"),
+    "magnetometer": ("mx", "my", "mz"),
+    "temperature": ("temp",),
+    "current": ("current_a",),
+    "throttle": ("throttle",),
+}
+VPS_DEFAULTS: dict[str, tuple[str, ...]] = {
+    "quaternion_xyzw": ("qx", "qy", "qz", "qw"),
+    "position": ("px", "py", "pz"),
+}
+TIME_DEFAULTS = tuple(
+    stem + suffix for stem in ("t", "time", "timestamp") for suffix in ("_s", "", "_ms", "_us", "_ns")
+)
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Positions of columns: `time` (None: the file has none), and of each value that the file has."""
+
+    time: int | None
+    values: dict[str, tuple[int, ...]]
+
+
+def find_columns(
+    dialect: Dialect, configured: Mapping[str, Any], defaults: Mapping[str, tuple[str, ...]], table: str, log_name: str
+) -> Columns:
+    """Positions of the columns of one table ("imu", "vps").
+
+    A configured column must be there; the default names are taken where the file has them, all of a sensor or none.
+
+    Raises
+    ------
+    UnreadableLog
+        `missing_column`, `duplicate_column`.
+    """
+    values = {}
+    for key, default in defaults.items():
+        wanted = configured.get(key)
+        names = (wanted,) if isinstance(wanted, str) else tuple(wanted or default)
+        if wanted or any(name in dialect.names for name in names):
+            values[key] = tuple(_position(name, dialect, f"csv.{table}.{key}", log_name) for name in names)
+    if configured.get("t"):
+        return Columns(_position(str(configured["t"]), dialect, f"csv.{table}.t", log_name), values)
+    times = [name for name in TIME_DEFAULTS if name in dialect.names]
+    return Columns(_position(times[0], dialect, f"csv.{table}.t", log_name) if times else None, values)
+
+
+def declared_units(dialect: Dialect, columns: Columns, summary: LogSummary, log_name: str) -> dict[str, str]:
+    """Unit of each sensor as its columns say it. Axes that disagree are a finding and give none."""
+    units = {}
+    for sensor, positions in columns.values.items():
+        if sensor not in ("gyroscope", "accelerometer", "magnetometer"):
+            continue
+        row = dialect.unit_row
+        found = {sensor_unit(sensor, dialect.names[place], row[place] if row else None) for place in positions}
+        if len(found) > 1:
+            listed = ", ".join(sorted(str(unit) for unit in found))
+            summary.add("unit_conflict", 1, f"{log_name}: the axes of the {sensor} are in different units ({listed}).")
+        elif (unit := found.pop()) is not None:
+            units[sensor] = unit
+    return units
+
+
+def _position(name: str, dialect: Dialect, key: str, log_name: str) -> int:
+    places = [place for place, known in enumerate(dialect.names) if known == name]
+    if len(places) == 1:
+        return places[0]
+    if places:
+        raise UnreadableLog(
+            "duplicate_column",
+            f"{log_name} has {len(places)} columns named {name!r}: which one is meant cannot be known. Rename one.",
+        )
+    raise UnreadableLog(
+        "missing_column",
+        f"{log_name} has no column {name!r} ({key}); {_nearest(name, dialect.names)}. Correct {key}.",
+    )
+
+
+def _nearest(name: str, names: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+    if close:
+        return "nearest: " + ", ".join(repr(candidate) for candidate in close)
+    return "it has " + ", ".join(repr(candidate) for candidate in names[:20])

@@ -1,0 +1,128 @@
+"""How a CSV file is written: separator, decimal sign, header, units row."""
+
+from __future__ import annotations
+
+import csv
+import re
+from contextlib import suppress
+from dataclasses import dataclass
+
+from fieldcal.errors import UnreadableLog
+from fieldcal.logs.csv.units import is_units_row
+
+SEPARATORS = ("\t", ";", ",")
+WHITESPACE = " "
+QUOTE = '"'
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$|[+-]?(nan|inf|infinity)$", re.IGNORECASE)
+_COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?$")
+_SEPARATOR_LINE = re.compile(r'"?sep=([,;\t|])"?$', re.IGNORECASE)
+_LINES_LOOKED_AT = 50
+COLUMNS_CAP = 10_000
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """What a look at the first lines found.
+
+    `first_row`: number of lines before the first row of data. `header`: the header line as it stands.
+    `unit_row`: cells of the units row, or None.
+    """
+
+    separator: str
+    decimal: str
+    names: tuple[str, ...]
+    header: bytes
+    unit_row: tuple[str, ...] | None
+    first_row: int
+
+    @property
+    def fields(self) -> int:
+        """Number of columns."""
+        return len(self.names)
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell is a number with a decimal point."""
+    return bool(_NUMBER.match(cell.strip()))
+
+
+def cells_of(line: str, separator: str) -> list[str]:
+    """The cells of one line, quotes taken off."""
+    if separator == WHITESPACE:
+        return line.split()
+    if QUOTE in line:
+        with suppress(csv.Error):
+            return [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
+    return [cell.strip() for cell in line.split(separator)]
+
+
+def find_dialect(block: bytes, log_name: str, separator: str | None, decimal: str | None) -> Dialect:
+    """The dialect of a file from its first lines (`separator` and `decimal` where configured).
+
+    Raises
+    ------
+    UnreadableLog
+        `missing_header`, `not_text`, `no_rows`, `too_many_columns`.
+    """
+    lines = block.split(b"\n", _LINES_LOOKED_AT * 4)[: _LINES_LOOKED_AT * 4]
+    texts = [_text(line) for line in lines]
+    body = [number for number, text in enumerate(texts) if text.strip() and not text.lstrip().startswith("#")]
+    if not body:
+        raise UnreadableLog("no_rows", f"{log_name} holds no rows. Nothing was recorded.")
+    declared = _SEPARATOR_LINE.match(texts[body[0]].strip())
+    if declared and len(body) > 1:
+        separator, body = separator or declared[1], body[1:]
+    place = body[0]
+    if b"\0" in lines[place] or (not texts[place].replace("\t", " ").isprintable()):
+        raise UnreadableLog("not_text", f"{log_name} does not begin with a readable header line. Check what it is.")
+    data = [texts[number] for number in body[1:_LINES_LOOKED_AT]]
+    found = separator or _separator(texts[place], data)
+    names, header, first_row = cells_of(texts[place], found), lines[place], place + 1
+    if found == WHITESPACE or QUOTE in texts[place]:
+        header = found.join(names).encode()
+    point = _decimal(data, found, decimal)
+    if all(is_number(cell.replace(point, ".")) or not cell for cell in names):
+        commented = [text for text in texts[:place] if text.lstrip().startswith("#")]
+        names = cells_of(commented[-1].lstrip("# "), found) if commented else []
+        if len(names) != len(cells_of(texts[place], found)):
+            raise UnreadableLog(
+                "missing_header",
+                f"{log_name} has no header: its first line holds only numbers. Put a line with the column names first.",
+            )
+        header, first_row = b"", place
+    if len(names) > COLUMNS_CAP:
+        raise UnreadableLog(
+            "too_many_columns",
+            f"{log_name} has {len(names)} columns, {COLUMNS_CAP} at most are read. Check what it is.",
+        )
+    unit_row = None
+    if header and data:
+        cells = cells_of(data[0], found)
+        if len(cells) == len(names) and is_units_row(cells):
+            unit_row, first_row = tuple(cells), body[1] + 1
+    return Dialect(found, point, tuple(names), header, unit_row, first_row)
+
+
+def _text(line: bytes) -> str:
+    try:
+        return line.decode("utf-8").strip("﻿")
+    except UnicodeDecodeError:
+        return line.decode("latin-1")
+
+
+def _separator(header: str, data: list[str]) -> str:
+    present = [separator for separator in SEPARATORS if separator in header]
+    for separator in present:
+        fields = len(cells_of(header, separator))
+        if data and sum(len(cells_of(line, separator)) == fields for line in data) > len(data) // 2:
+            return separator
+    return present[0] if present else WHITESPACE
+
+
+def _decimal(data: list[str], separator: str, configured: str | None) -> str:
+    if configured or separator == ",":
+        return configured or "."
+    cells = [cell for line in data for cell in cells_of(line, separator)]
+    commas = sum(bool(_COMMA_NUMBER.match(cell)) for cell in cells)
+    points = sum("." in cell and is_number(cell) for cell in cells)
+    return "," if commas > points else "."

@@ -1,0 +1,1 @@
+"""Message encodings: bytes of many messages to arrays."""

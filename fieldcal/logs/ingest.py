@@ -1,0 +1,227 @@
+"""From a reader's batches to tidy signals, the flight's facts and a verdict on the log.
+
+Tidy: sorted by stamp, no row twice, one row a stamp, finite readings. Whatever is left out is counted and told.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal.config.configuration import Vehicle
+from fieldcal.config.flight_settings import flight_settings
+from fieldcal.errors import UnreadableLog
+from fieldcal.logs import Finding, LogReader, LogSummary, open_log
+from fieldcal.logs.discovery import folder_parts
+from fieldcal.logs.interface import EPOCH_KNOWN_AFTER_NS
+from fieldcal.logs.tidy import HELD_ROWS, Disordered, TidySignal
+
+LEAST_SAMPLES = 10
+SECONDS_ALLOWED = 60.0
+TOO_SLOW = "too_slow"
+"""The one refusal that another try may not meet again."""
+
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+class TidyLog:
+    """A log being tidied: iterate `tables()` to its end, then ask for `facts()`.
+
+    Parameters
+    ----------
+    reader : LogReader
+        The opened log.
+    name : str
+        What findings call it.
+    whole : bool
+        Hold every row until the end: for logs that were found `Disordered`.
+    seconds : float
+        How long reading may take.
+    """
+
+    def __init__(self, reader: LogReader, name: str, *, whole: bool = False, seconds: float = math.inf) -> None:
+        self._give_up = time.monotonic() + seconds
+        self._seconds = seconds
+        self._reader = reader
+        self._name = name
+        self._held_rows = None if whole else HELD_ROWS
+        self._signals: dict[str, TidySignal] = {}
+        self._temperature: list[float] | None = None
+        self._position = np.zeros(3)
+        self._read_through = False
+
+    def tables(self) -> Iterator[tuple[str, pl.DataFrame]]:
+        """Tidy rows, (signal table, frame), each table in order of time.
+
+        Raises
+        ------
+        UnreadableLog
+            The log cannot be read, nothing in it is usable, or it takes too long (`too_slow`).
+        Disordered
+            See `TidySignal.add`.
+        """
+        for table, columns in self._reader.batches():
+            if time.monotonic() > self._give_up:
+                raise UnreadableLog(
+                    TOO_SLOW,
+                    f"{self._name} was still being read after {self._seconds:.0f} s, {SECONDS_ALLOWED:.0f} s and 1 s "
+                    "for every MB are allowed. Check the disk; the next night tries again.",
+                )
+            signal = self._signals.setdefault(table, TidySignal(table, self._held_rows))
+            for frame in signal.add(columns):
+                yield table, self._seen(table, frame)
+        self._read_through = True
+        for table, signal in self._signals.items():
+            for frame in signal.finish():
+                yield table, self._seen(table, frame)
+        if "imu" not in self._signals or not self._signals["imu"].rows:
+            raise UnreadableLog(
+                "no_imu",
+                f"{self._name}: not one usable IMU sample"
+                + "".join(f" ({finding.sentence})" for finding in self._findings()[:1])
+                + ". Check the topics or columns in fieldcal.toml.",
+            )
+        if self._signals["imu"].rows < LEAST_SAMPLES:
+            raise UnreadableLog(
+                "too_few_samples",
+                f"{self._name} holds {self._signals['imu'].rows} IMU samples at different times, {LEAST_SAMPLES} are "
+                "the least." + "".join(f" {finding.sentence}" for finding in self._findings()[:1]),
+            )
+
+    def units(self) -> dict[str, str] | None:
+        """Unit per sensor; None while the log may still say otherwise."""
+        return dict(self._reader.summary.units) if self._read_through else None
+
+    def _seen(self, table: str, frame: pl.DataFrame) -> pl.DataFrame:
+        if table == "temperature":
+            t = frame["temperature_degc"].to_numpy()
+            low, total, high = self._temperature or [np.inf, 0.0, -np.inf]
+            self._temperature = [min(low, float(t.min())), total + float(t.sum()), max(high, float(t.max()))]
+        elif table == "position":
+            self._position += (
+                frame.select("latitude_deg", "longitude_deg", "altitude_m").fill_nan(0.0).sum().to_numpy()[0]
+            )
+        return frame
+
+    def _findings(self) -> list[Finding]:
+        own = [finding for signal in self._signals.values() for finding in signal.findings(self._name)]
+        return [*self._reader.summary.findings, *own]
+
+    def facts(self) -> dict[str, Any]:
+        """What is known of the flight, plain JSON; unknown numbers are None."""
+        summary, findings = self._reader.summary, self._findings()
+        imu = self._signals["imu"]
+        first_ns, last_ns = imu.first_ns or 0, imu.last_ns or 0
+        vps, place = self._signals.get("vps"), self._signals.get("position")
+        low, total, high = self._temperature or (None, None, None)
+        n_temperatures = self._signals["temperature"].rows if self._temperature else 1
+        return {
+            **declared(summary),
+            "duration_s": (last_ns - first_ns) * 1e-9,
+            "imu_rate_hz": imu.rate_hz(),
+            "vps_rate_hz": vps.rate_hz() if vps else None,
+            "n_samples": imu.rows,
+            "rows": {table: signal.rows for table, signal in sorted(self._signals.items())},
+            "temperature_min_degc": low,
+            "temperature_mean_degc": None if total is None else total / n_temperatures,
+            "temperature_max_degc": high,
+            "started_at_ns": first_ns if summary.epoch_known and first_ns > EPOCH_KNOWN_AFTER_NS else None,
+            "position": [float(v) for v in self._position / place.rows] if place and place.rows else None,
+            **verdict(findings),
+        }
+
+
+def tidy_log(path: Path, vehicle: Vehicle, *, whole: bool = False) -> TidyLog:
+    """Open a log for tidying. Raises as `open_log`."""
+    reader = open_log(path, vehicle)
+    size = sum(part.stat().st_size for part in (folder_parts(path) if path.is_dir() else [path]))
+    return TidyLog(reader, path.name, whole=whole, seconds=SECONDS_ALLOWED + size / 1e6)
+
+
+def logged_units(path: Path, vehicle: Vehicle) -> dict[str, str]:
+    """Unit per sensor, from a pass through the whole log: what long logs need whose word on it may come last."""
+    reader = open_log(path, vehicle)
+    for _ in reader.batches():
+        pass
+    return dict(reader.summary.units)
+
+
+def declared(summary: LogSummary) -> dict[str, Any]:
+    """What the log says of itself."""
+    return {
+        "units": dict(summary.units),
+        "world": summary.world,
+        "body": summary.body,
+        "gravity_sign": summary.gravity_sign,
+        "verifiable": summary.verifiable,
+    }
+
+
+def verdict(findings: list[Finding]) -> dict[str, Any]:
+    """Findings as plain JSON, and the verdict they add up to with the gravest one's code and sentence."""
+    listed = [{"code": f.code, "count": f.count, "sentence": f.sentence} for f in findings]
+    for name, grave in (
+        ("quarantined", [f for f in findings if f.fatal]),
+        ("partial", [f for f in findings if f.loses_data]),
+    ):
+        if grave:
+            return {"verdict": name, "reason_code": grave[0].code, "reason": grave[0].sentence, "findings": listed}
+    return {"verdict": "ok", "reason_code": None, "reason": None, "findings": listed}
+
+
+def rejected(reason_code: str, reason: str) -> dict[str, Any]:
+    """Facts of a log in which nothing is usable."""
+    unknown = ("duration_s", "imu_rate_hz", "vps_rate_hz", "n_samples", "started_at_ns", "position")
+    temperatures = ("temperature_min_degc", "temperature_mean_degc", "temperature_max_degc")
+    return {
+        **dict.fromkeys((*unknown, *temperatures)),
+        **declared(LogSummary("")),
+        "rows": {},
+        "verdict": "rejected",
+        "reason_code": reason_code,
+        "reason": reason,
+        "findings": [],
+    }
+
+
+def read_flight(path: Path, vehicle: Vehicle) -> tuple[dict[str, pl.DataFrame], dict[str, Any]]:
+    """A whole log in memory: signal table → tidy frame, and the facts. Unreadable: `rejected`, no tables."""
+    for whole in (False, True):
+        frames: dict[str, list[pl.DataFrame]] = {}
+        try:
+            log = tidy_log(path, vehicle, whole=whole)
+            for table, frame in log.tables():
+                frames.setdefault(table, []).append(frame)
+        except Disordered:
+            continue
+        except UnreadableLog as error:
+            return {}, rejected(error.reason_code, error.sentence)
+        return {table: pl.concat(parts) for table, parts in frames.items()}, log.facts()
+    raise AssertionError("a log that is held whole cannot be disordered")
+
+
+def started_at(facts: Mapping[str, Any]) -> datetime | None:
+    """Time of the first IMU sample, UTC, to the microsecond; None when the log's clock has no known epoch."""
+    stamp = facts["started_at_ns"]
+    return None if stamp is None else EPOCH + timedelta(microseconds=stamp // 1000)
+
+
+def settings_of(facts: Mapping[str, Any], vehicle: Vehicle) -> dict[str, Any]:
+    """Settings of the stages for this flight (`config.flight_settings.flight_settings`)."""
+    place = facts["position"]
+    return flight_settings(
+        vehicle,
+        units=facts["units"],
+        world=facts["world"],
+        body=facts["body"],
+        gravity_sign=facts["gravity_sign"],
+        position=None if place is None else (place[0], place[1], place[2]),
+        started_at=started_at(facts),
+    )

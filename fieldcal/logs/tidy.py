@@ -1,0 +1,257 @@
+"""One signal made tidy: sorted by stamp, one clock, no row twice, one row a stamp, finite readings.
+
+Whatever is left out is counted and told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import polars as pl
+
+from fieldcal.errors import UnreadableLog
+from fieldcal.logs import SIGNAL_COLUMNS, Columns, Finding, batch_frame, stamps
+
+SENSOR_TABLES = ("imu", "magnetometer", "vps")
+MAY_BE_UNKNOWN = ("px_m", "py_m", "pz_m", "altitude_m", "current_a", "throttle")
+HELD_ROWS = 1 << 17
+WHOLE_ROWS_CAP = 6_000_000
+CLOCK_RESET_NS = 1_000_000_000
+GAP_NS = 1_000_000_000
+MOST_REPEATED = 0.5
+PLAUSIBLE_RATE_HZ = (1.0, 50_000.0)
+MOST_INTERVALS = 1 << 20
+
+
+class Disordered(Exception):
+    """A row belongs before rows that were handed on already: the log must be tidied as a whole."""
+
+
+class TidySignal:
+    """One signal being tidied. Rows are held back so that small disorder is sorted while streaming.
+
+    Parameters
+    ----------
+    table : str
+        Signal table.
+    held_rows : int or None
+        How many of the latest rows are held back; None holds all until the end.
+    """
+
+    def __init__(self, table: str, held_rows: int | None = HELD_ROWS) -> None:
+        self.table = table
+        self.rows = self.not_finite = self.duplicates = self.conflicts = self.disordered = 0
+        self.wild = self.masked = self.far = self.back_ns = self.gaps = self.longest_gap_ns = 0
+        self.first_ns: int | None = None
+        self.last_ns: int | None = None
+        self._unwrap = stamps.Unwrapper()
+        self._held_rows = held_rows
+        self._held: list[pl.DataFrame] = []
+        self._n_held = 0
+        self._suspicious = False
+        self._latest_ns: int | None = None
+        self._previous_ns: int | None = None
+        self._n_late = 0
+        self._intervals = np.empty(0, np.int64)
+        self._keep_every = 1
+
+    def add(self, columns: Columns) -> Iterator[pl.DataFrame]:
+        """Take a batch; rows that no later one can come before.
+
+        Raises
+        ------
+        Disordered
+            Rows were yielded already that this batch puts in question.
+        UnreadableLog
+            `too_disordered`: so many rows would have to be held to put them in order.
+        """
+        frame = self._finite(batch_frame(self.table, {**columns, "t_ns": self._unwrap(columns["t_ns"])}))
+        if frame.is_empty():
+            return
+        t = frame["t_ns"].to_numpy()
+        latest = np.maximum.accumulate(t if self._latest_ns is None else np.r_[self._latest_ns, t])
+        before = latest[:-1] if self._latest_ns is not None else np.r_[t[0], latest[:-1]]
+        behind = np.maximum(before - t, 0)
+        self.disordered += int(np.count_nonzero(behind))
+        odd, self._n_late = stamps.suspicious(t, self._previous_ns, behind, self._n_late)
+        self._suspicious |= odd
+        self._latest_ns, self._previous_ns = int(latest[-1]), int(t[-1])
+        if self.last_ns is not None and (self._suspicious or int(t.min()) <= self.last_ns):
+            raise Disordered(self.table)
+        self._held.append(frame)
+        self._n_held += len(frame)
+        if self._n_held > WHOLE_ROWS_CAP:
+            raise UnreadableLog(
+                "too_disordered",
+                f"The stamps of {self.table} are so out of order that more than {WHOLE_ROWS_CAP} rows would have to be "
+                "held to sort them. Sort the log, or split it.",
+            )
+        if self._held_rows is not None and not self._suspicious and self._n_held > 2 * self._held_rows:
+            held = pl.concat(self._held).sort("t_ns", maintain_order=True)
+            t_ns = held["t_ns"].to_numpy()
+            cut = int(np.searchsorted(t_ns, t_ns[-self._held_rows]))
+            self._held, self._n_held = [held[cut:]], len(held) - cut
+            if cut:
+                yield self._one_a_stamp(held[:cut])
+
+    def finish(self) -> Iterator[pl.DataFrame]:
+        """The rows still held."""
+        if self._n_held:
+            held = pl.concat(self._held)
+            self._held, self._n_held = [], 0
+            if self._suspicious or (self.disordered and self.last_ns is None):
+                held = self._of_one_clock(held)
+            yield self._one_a_stamp(held.sort("t_ns", maintain_order=True))
+
+    def rate_hz(self) -> float | None:
+        """Median rate; None below two samples."""
+        if self._intervals.size == 0:
+            return None
+        return float(1e9 / np.median(self._intervals))
+
+    def _finite(self, frame: pl.DataFrame) -> pl.DataFrame:
+        names = [n for n in SIGNAL_COLUMNS[self.table] if n != "t_ns" and n not in MAY_BE_UNKNOWN]
+        whole = frame.filter(pl.all_horizontal(pl.col(names).is_finite().fill_null(True)))
+        self.not_finite += len(frame) - len(whole)
+        return whole
+
+    def _of_one_clock(self, frame: pl.DataFrame) -> pl.DataFrame:
+        """Of all rows, in the order of recording, those of the longest stretch of one clock, without wild stamps."""
+        t = frame["t_ns"].to_numpy()
+        order = np.argsort(t, kind="stable")
+        copy = np.zeros(len(t), dtype=bool)
+        copy[order] = self._copies(frame[order])[1]
+        judged = stamps.judge(t, copy)
+        counts = np.bincount(judged.stretch, weights=~judged.wild & ~copy)
+        longest = judged.stretch == int(np.argmax(counts))
+        self.wild, self.masked = int(judged.wild.sum()), int((~longest & ~judged.wild & ~copy).sum())
+        self.back_ns, self.far = judged.back_ns, judged.far
+        kept = longest & ~judged.wild
+        self.disordered = int(np.count_nonzero(np.maximum.accumulate(t[kept]) > t[kept]))
+        return frame.filter(pl.Series(kept))
+
+    def _copies(self, frame: pl.DataFrame) -> tuple[np.ndarray, np.ndarray]:
+        """Of sorted rows: which are the first of their stamp, and which of the others repeat it in every value."""
+        t = frame["t_ns"].to_numpy()
+        first = np.r_[True, t[1:] != t[:-1]]
+        copy = np.zeros(len(t), dtype=bool)
+        if not first.all():
+            leaders = np.flatnonzero(first)[np.cumsum(first) - 1]
+            others = np.flatnonzero(~first)
+            one, other = frame[leaders[others]], frame[others]
+            same = [other[n].eq_missing(one[n]).to_numpy() for n in SIGNAL_COLUMNS[self.table]]
+            copy[others] = np.logical_and.reduce(same)
+        return first, copy
+
+    def _one_a_stamp(self, frame: pl.DataFrame) -> pl.DataFrame:
+        """Of the sorted rows the first of every stamp; the others are counted as copies or contradictions."""
+        first, copy = self._copies(frame)
+        if not first.all():
+            self.duplicates += int(np.count_nonzero(copy))
+            self.conflicts += int(np.count_nonzero(~first & ~copy))
+            frame = frame.filter(pl.Series(first))
+        self._account(frame["t_ns"].to_numpy())
+        return frame
+
+    def _account(self, t: np.ndarray) -> None:
+        intervals = np.diff(t if self.last_ns is None else np.r_[self.last_ns, t])
+        self.gaps += int(np.count_nonzero(intervals > GAP_NS))
+        self.longest_gap_ns = max(self.longest_gap_ns, int(intervals.max(initial=0)))
+        self._intervals = np.concatenate([self._intervals, intervals[:: self._keep_every]])
+        while self._intervals.size > MOST_INTERVALS:
+            self._intervals, self._keep_every = self._intervals[::2], self._keep_every * 2
+        self.first_ns = int(t[0]) if self.first_ns is None else self.first_ns
+        self.last_ns = int(t[-1])
+        self.rows += len(t)
+
+    def findings(self, name: str) -> Iterator[Finding]:
+        """What was met, as findings on the log called `name`."""
+        table, sensors = self.table, self.table in SENSOR_TABLES
+        yield from self._clock_findings(name)
+        if self.not_finite:
+            yield Finding(
+                "not_finite",
+                self.not_finite,
+                f"{name}: {self.not_finite} rows of {table} hold NaN or infinity and were left out.",
+                loses_data=sensors,
+            )
+        if self.conflicts > MOST_REPEATED * (self.rows + self.conflicts):
+            yield Finding(
+                "clock_stands",
+                self.conflicts,
+                f"{name}: {self.conflicts} of {self.rows + self.conflicts} rows of {table} carry the same time as "
+                "another row with other values: the clock stands, or the times were rounded. Export the log again.",
+                fatal=sensors,
+            )
+        elif self.conflicts:
+            yield Finding(
+                "repeated_stamps",
+                self.conflicts,
+                f"{name}: {self.conflicts} rows of {table} repeat a time stamp with other values; the first of each "
+                "stamp was kept.",
+                loses_data=sensors,
+            )
+        if self.duplicates:
+            yield Finding(
+                "duplicate_rows",
+                self.duplicates,
+                f"{name}: {self.duplicates} rows of {table} stand in the log twice and were taken once.",
+            )
+
+    def _clock_findings(self, name: str) -> Iterator[Finding]:
+        table, sensors = self.table, self.table in SENSOR_TABLES
+        if self._unwrap.wraps:
+            yield Finding(
+                "clock_wrapped",
+                self._unwrap.wraps,
+                f"{name}: the counter behind the stamps of {table} began again {self._unwrap.wraps} time(s) after "
+                f"{self._unwrap.period_ns * 1e-9:.3f} s; its period was added.",
+            )
+        if self.back_ns > CLOCK_RESET_NS:
+            yield Finding(
+                "clock_reset",
+                self.masked,
+                f"{name}: the stamps of {table} step back by {self.back_ns * 1e-9:.3f} s into time "
+                f"that is recorded already ({self.masked} rows): the clock was reset. Split the log where it was.",
+                fatal=sensors,
+            )
+        elif self.masked:
+            what = f"set back by {self.back_ns * 1e-9:.3f} s" if self.back_ns else "set by more than a day"
+            yield Finding(
+                "clock_set",
+                self.masked,
+                f"{name}: the clock of {table} was {what} during the recording; its longest stretch was kept, "
+                f"{self.masked} rows beside it were left out.",
+                loses_data=sensors,
+            )
+        elif self.disordered:
+            yield Finding(
+                "out_of_order",
+                self.disordered,
+                f"{name}: {self.disordered} rows of {table} came after later ones and were sorted in.",
+            )
+        if self.wild:
+            yield Finding(
+                "wild_stamps",
+                self.wild,
+                f"{name}: {self.wild} rows of {table} carry times far from those recorded beside them and were left "
+                "out.",
+                loses_data=sensors,
+            )
+        rate = self.rate_hz()
+        if table == "imu" and rate is not None and not PLAUSIBLE_RATE_HZ[0] <= rate <= PLAUSIBLE_RATE_HZ[1]:
+            yield Finding(
+                "implausible_rate",
+                self.rows,
+                f"{name}: read as they are, the stamps make the IMU sample at {rate:.4g} Hz. Correct the unit of time "
+                "(csv.time_unit) or the log.",
+                fatal=True,
+            )
+        elif sensors and self.gaps and rate is not None and rate * GAP_NS * 1e-9 > stamps.PAUSE:
+            yield Finding(
+                "gaps",
+                self.gaps,
+                f"{name}: {table} pauses {self.gaps} time(s) for over {GAP_NS * 1e-9:.0f} s, at the longest for "
+                f"{self.longest_gap_ns * 1e-9:.3f} s; nothing is interpolated across.",
+            )

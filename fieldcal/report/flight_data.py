@@ -1,0 +1,151 @@
+"""All that a flight's page is made of: rows of the history, readings, and what is left of its stages' tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from fieldcal.errors import FieldcalError
+from fieldcal.flight.calibrate import CalibratedLog
+from fieldcal.flight.rows import rows_frame
+from fieldcal.schemas import SIGNAL_TABLES, SchemaMismatch
+from fieldcal.stages.pipeline import PIPELINE
+from fieldcal.stages.results import plain
+from fieldcal.warehouse import Warehouse, WarehouseError
+from fieldcal.warehouse.questions import existing
+from fieldcal.warehouse.stage_store import StageStore
+from fieldcal.words.rows import rows_of, unfolded
+
+STAGE_TABLES = ("manoeuvre.segments", "smoothing.samples", "attitude_pass2.attitude", "vps_sync.vps_aligned")
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class FlightData:
+    """One flight. `tables` are named `stage.table` as in the pipeline, `settings` are the stages' parameters.
+
+    `gone` names stages whose tables should be there and are not.
+    """
+
+    flight: Row
+    calibration: pl.DataFrame
+    fit: list[dict[str, Any]]
+    sync: Row | None
+    run: list[dict[str, Any]]
+    tables: Mapping[str, pl.DataFrame]
+    settings: Mapping[str, Any]
+    gone: tuple[str, ...] = field(default=())
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Unit of each sensor's logged readings."""
+        ingest = next((row for row in self.run if row["stage"] == "ingest"), None)
+        return {} if ingest is None else (ingest["measured"] or {}).get("units") or {}
+
+
+def read_flight(root: Path, flight_id: str) -> FlightData:
+    """A flight from the warehouse.
+
+    Raises
+    ------
+    FieldcalError
+        `no_warehouse`; `not_found`: no flight, or more than one, has this id, this start of an id, or this `log_uri`.
+    """
+    warehouse = existing(root)
+    flight = unfolded(rows_of(_one_flight(warehouse, flight_id))[0])
+    ids = {"vehicle_id": flight["vehicle_id"], "flight_id": flight["flight_id"]}
+    history = {name: warehouse.scan(name, **ids).collect() for name in ("calibration", "fit", "sync", "run")}
+    order = {stage: i for i, stage in enumerate(("ingest", *(stage.name for stage in PIPELINE)))}
+    run = sorted(
+        (unfolded(row) for row in rows_of(history["run"])), key=lambda row: order.get(row["stage"], len(order))
+    )
+    tables: dict[str, pl.DataFrame] = {}
+    for name in SIGNAL_TABLES:
+        signal = _signal(warehouse, name, ids)
+        if not signal.is_empty():
+            tables[f"ingest.{name}"] = signal.drop("vehicle_id", "flight_id")
+    stages, settings, gone = _stages(root, flight["flight_id"], run)
+    sync = rows_of(history["sync"])
+    return FlightData(
+        flight,
+        history["calibration"],
+        rows_of(history["fit"]),
+        sync[0] if sync else None,
+        run,
+        tables | stages,
+        settings,
+        gone,
+    )
+
+
+def of_log(log: CalibratedLog) -> FlightData:
+    """A flight calibrated in memory, without a warehouse."""
+    document = log.document
+    return FlightData(
+        document["flight"],
+        rows_frame("calibration", document["calibration"]),
+        document["fit"],
+        document["sync"],
+        document["run"],
+        log.tables,
+        plain(log.settings),
+    )
+
+
+def _one_flight(warehouse: Warehouse, wanted: str) -> pl.DataFrame:
+    flights = warehouse.scan("flight")
+    for same in (
+        pl.col("flight_id") == wanted,
+        pl.col("log_uri") == wanted,
+        pl.col("flight_id").str.starts_with(wanted) if wanted else pl.lit(False),
+    ):
+        found = flights.filter(same).collect()
+        if found.height == 1:
+            return found
+        if found.height > 1:
+            several = ", ".join(found["flight_id"].head(3).to_list())
+            raise FieldcalError("not_found", f'"{wanted}" is the start of {found.height} flight ids: {several}, …')
+    raise FieldcalError(
+        "not_found", f'No flight "{wanted}" is in the history; fieldcal history --json lists flight ids.'
+    )
+
+
+def _signal(warehouse: Warehouse, name: str, ids: Mapping[str, str]) -> pl.DataFrame:
+    """Readings of the flight; none where they were removed or are damaged (`fieldcal verify` tells which)."""
+    try:
+        return warehouse.scan(name, **ids).collect()
+    except (OSError, pl.exceptions.PolarsError):
+        return pl.DataFrame()
+
+
+def _stages(
+    root: Path, flight_id: str, run: list[dict[str, Any]]
+) -> tuple[dict[str, pl.DataFrame], dict[str, Any], tuple[str, ...]]:
+    """Tables that are there, the parameters of their stages, and the stages that should be there and are not."""
+    store = StageStore(root)
+    tables: dict[str, pl.DataFrame] = {}
+    settings: dict[str, Any] = {}
+    gone = []
+    for row in run:
+        stage = row["stage"]
+        if stage == "ingest" or row["status"] == "failed":
+            continue
+        record = store.record(stage, flight_id, str(row["run_key"]))
+        settings |= (record or {}).get("params") or {}
+        wanted = [name for name in STAGE_TABLES if name.split(".")[0] == stage]
+        if record is None:
+            gone.append(stage)
+            continue
+        for name in wanted:
+            table = name.split(".")[1]
+            if table not in record["outputs"]:
+                continue
+            try:
+                tables[name] = store.load(stage, flight_id, row["run_key"], [table])[table]
+            except (WarehouseError, SchemaMismatch):
+                gone.append(stage)
+    return tables, settings, tuple(gone)

@@ -1,0 +1,53 @@
+"""What several reports ask of the history."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from datetime import datetime
+from typing import Any
+
+import polars as pl
+
+from fieldcal.report.words import day
+from fieldcal.stages.warm_up import METHOD as WARM_UP
+from fieldcal.warehouse import Warehouse
+
+
+def newest(warehouse: Warehouse) -> datetime | None:
+    """Start of the newest flight of the fleet; None while no log's clock has a known epoch."""
+    moment: datetime | None = warehouse.scan("flight").select(pl.col("started_at").max()).collect().item()
+    return moment
+
+
+def usable_flights(warehouse: Warehouse, vehicle_id: str | None = None) -> pl.DataFrame:
+    """Flights that gave at least one constant, oldest first: vehicle_id, flight_id, started_at."""
+    return (
+        warehouse.scan("calibration", vehicle_id=vehicle_id)
+        .filter((pl.col("status") == "ok") & pl.col("value").is_not_null() & (pl.col("method") != WARM_UP))
+        .select("vehicle_id", "flight_id", "started_at")
+        .unique()
+        .sort("vehicle_id", "started_at", "flight_id", nulls_last=False)
+        .collect()
+    )
+
+
+def as_of_sentence(as_of: datetime | None, given: bool) -> str:
+    """What ages on the page count to."""
+    if as_of is None:
+        return "No log's clock has a known epoch: ages are unknown."
+    what = "the moment asked for" if given else "the start of the newest flight in the warehouse"
+    return f"Ages count to {day(as_of)} UTC, {what}."
+
+
+def unfold(text: Any) -> Any:
+    """A JSON text of the history (`findings`, `measured`, `versions`) as an object."""
+    return json.loads(text) if isinstance(text, str) else text
+
+
+def reason_of(row: Mapping[str, Any]) -> str:
+    """Why a row of the view `refusals` is there: its sentence, else its code."""
+    detail = row["detail"]
+    if row["level"] == "stage":
+        detail = (unfold(detail) or {}).get("reason")
+    return str(detail or row["reason_code"] or "")

@@ -1,0 +1,77 @@
+"""The one parameter of each vehicle that the fleet's page draws: the least steady, else the gyroscope's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import polars as pl
+
+from fieldcal.report.plot import sparkline
+from fieldcal.report.trend import STATUSES
+from fieldcal.report.words import PARAMETERS, count, preferred, scientific, unit, with_unit
+from fieldcal.warehouse import Warehouse
+
+POINTS = 60
+PLACE = ("sensor", "method", "parameter", "axis")
+SENSORS = ("gyroscope", "accelerometer", "magnetometer")
+LEVELS = ("zero_bias", "bias", "scale")
+Place = tuple[str, str, str, str]
+
+
+def key_parameters(warehouse: Warehouse, trends: Mapping[str, pl.DataFrame]) -> dict[str, tuple[str, str]]:
+    """For each vehicle the key parameter of its present IMU, in words and drawn. `trends`: `drift` by IMU."""
+    rows = (
+        warehouse.scan("calibration")
+        .filter((pl.col("status") == "ok") & pl.col("value").is_not_null())
+        .select("vehicle_id", "imu_id", *PLACE, "value", "unit", "started_at", "flight_id")
+        .sort("started_at", "flight_id", nulls_last=False)
+        .collect()
+    )
+    told = {}
+    for (vehicle,), own in rows.partition_by("vehicle_id", as_dict=True).items():
+        imu = own["imu_id"][-1]
+        told[str(vehicle)] = _drawn(own.filter(pl.col("imu_id") == imu), trends.get(imu))
+    return told
+
+
+def _drawn(own: pl.DataFrame, drift: pl.DataFrame | None) -> tuple[str, str]:
+    there: set[Any] = set(own.select(PLACE).unique().iter_rows())
+    unsteady = _least_steady(drift, there)
+    place = _gyroscope(there) if unsteady is None else tuple(unsteady[name] for name in PLACE)
+    shown = own.filter(*(pl.col(name) == value for name, value in zip(PLACE, place, strict=True))).tail(POINTS)
+    values = shown["value"].to_list()
+    step = None if unsteady is None else unsteady["change_at"]
+    after = [i for i, at in enumerate(shown["started_at"]) if step is not None and at is not None and at >= step]
+    name, own_unit = f"{place[0]} {place[2]} {place[3]}", shown["unit"][-1]
+    span = f"{scientific(values[0])} to {scientific(values[-1])} {unit(own_unit)}".strip()
+    label = f"{name} over {count(len(values), 'flight')}: {span}"
+    marked = after[0] if after and after[0] else None
+    return f"{name}: {with_unit(scientific(values[-1]), own_unit)}", sparkline(values, marked, label)
+
+
+def _least_steady(drift: pl.DataFrame | None, there: set[Any]) -> dict[str, Any] | None:
+    """The row of the IMU's trends that is least steady and has a history to draw; None where all are steady."""
+    rows = [] if drift is None else list(drift.iter_rows(named=True))
+    found = [
+        row
+        for row in rows
+        if row["status"] not in ("stable", "insufficient") and tuple(row[name] for name in PLACE) in there
+    ]
+    return min(found, key=_steadiness, default=None)
+
+
+def _steadiness(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    status = STATUSES.index(row["status"]) if row["status"] in STATUSES else len(STATUSES)
+    parameter = PARAMETERS.index(row["parameter"]) if row["parameter"] in PARAMETERS else len(PARAMETERS)
+    return status, parameter, -abs(row["last_z"] or 0.0), *(row[name] for name in PLACE)
+
+
+def _gyroscope(there: set[Any]) -> Place:
+    """Level of the gyroscope's first axis by its most exact method; of another sensor where there is none."""
+    sensors = {place[0] for place in there}
+    sensor = next(name for name in (*SENSORS, *sorted(sensors)) if name in sensors)
+    method = preferred({place[1] for place in there if place[0] == sensor})
+    parameters = {place[2] for place in there if place[:2] == (sensor, method)}
+    parameter = next(name for name in (*LEVELS, *sorted(parameters)) if name in parameters)
+    return sensor, method, parameter, min(place[3] for place in there if place[:3] == (sensor, method, parameter))

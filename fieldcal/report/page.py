@@ -1,0 +1,158 @@
+"""What a report is made of, and its HTML: Jinja2 fills the templates and escapes every text that is not markup already.
+
+A page is plain data: sections of `Text`, `Notice`, `Heading`, `Table`, `Plot` and `Folded`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import resources
+from typing import ClassVar
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+import fieldcal
+
+STATUS_KIND = {
+    **dict.fromkeys(("ok", "stable"), "ok"),
+    **dict.fromkeys(("partial", "drifting", "refused", "outlier", "expired"), "look"),
+    **dict.fromkeys(("quarantined", "rejected", "failed", "step"), "bad"),
+}
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph."""
+
+    kind: ClassVar = "text"
+    text: str
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A paragraph that must not be overlooked."""
+
+    kind: ClassVar = "notice"
+    text: str
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading below the section's."""
+
+    kind: ClassVar = "heading"
+    text: str
+
+
+@dataclass(frozen=True)
+class Column:
+    """A table's column: its name, and "n" (numbers, to the right), "id", "wide", "nowrap" or nothing."""
+
+    name: str
+    kind: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table whose first column names its rows. `more` says what was left out."""
+
+    kind: ClassVar = "table"
+    caption: str
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[str]]
+    more: str = ""
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A drawing with its caption."""
+
+    kind: ClassVar = "figure"
+    anchor: str
+    svg: Markup
+    caption: str
+
+
+Simple = Text | Table | Plot
+
+
+@dataclass(frozen=True)
+class Folded:
+    """Parts behind a line that opens them."""
+
+    kind: ClassVar = "folded"
+    summary: str
+    parts: Sequence[Simple]
+
+
+Part = Text | Notice | Heading | Table | Plot | Folded
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading with its parts."""
+
+    anchor: str
+    heading: str
+    parts: Sequence[Part]
+
+
+@dataclass(frozen=True)
+class Page:
+    """A whole report. `up` is (address, text) of the page above it."""
+
+    title: str
+    lead: Sequence[str]
+    facts: Sequence[tuple[str, str]]
+    sections: Sequence[Section]
+    footer: str = ""
+    up: tuple[str, str] | None = field(default=None)
+
+
+def html(page: Page) -> str:
+    """The page as one file that needs nothing else."""
+    up = None if page.up is None else {"href": page.up[0], "text": page.up[1]}
+    return (
+        _environment()
+        .get_template("report.html")
+        .render(
+            title=page.title,
+            lead=page.lead,
+            facts=page.facts,
+            sections=page.sections,
+            footer=page.footer,
+            up=up,
+            version=fieldcal.__version__,
+            style=_style(),
+        )
+    )
+
+
+def badge(status: str | None) -> Markup:
+    """A status as a coloured word."""
+    word = status or "unknown"
+    return Markup('<span class="badge {}">{}</span>').format(STATUS_KIND.get(word, "none"), word)
+
+
+def link(href: str, text: str) -> Markup:
+    """A link; `href` is a relative address made of encoded ids."""
+    return Markup('<a href="{}">{}</a>').format(href, text)
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader("fieldcal.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+@cache
+def _style() -> Markup:
+    return Markup(resources.files("fieldcal.report").joinpath("templates/style.css").read_text(encoding="utf-8"))

@@ -1,0 +1,79 @@
+"""The table drift in words and curves: what a row's regression says at a time and temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal.geometry.rotation import Array
+from fieldcal.report.words import count, day, scientific, with_unit
+
+STATUSES = ("step", "drifting", "outlier", "stable", "insufficient")
+"""Worst first; `insufficient` says nothing, so a vehicle has it only where nothing else is known."""
+
+REFERENCE_DEGC = 25.0
+DAY_S = 86400.0
+
+
+def worst_status(drift: pl.DataFrame | None) -> str | None:
+    """Worst status of the rows; None where there are none."""
+    if drift is None or drift.is_empty():
+        return None
+    there = set(drift["status"].to_list())
+    return next((status for status in STATUSES if status in there), min(map(str, there)))
+
+
+def change_sentence(row: Mapping[str, Any], siblings: Sequence[float]) -> str:
+    """What is not steady about a drift row: its own sentence, and what the siblings show of an outlier."""
+    told = str(row["reason"] or "")
+    if row["status"] == "outlier" and siblings:
+        median = with_unit(scientific(float(np.median(siblings))), row["unit"])
+        told = f"{told} Median of {count(len(siblings), 'sibling')} at 25 °C: {median}.".strip()
+    if told:
+        return told
+    if row["change_at"] is not None:
+        return f"Step at the flight of {day(row['change_at'])}."
+    slope = scientific(row["slope_per_day"], row["slope_per_day_sd"])
+    return "–" if slope == "–" else f"{with_unit(slope, row['unit'])} per day."
+
+
+def warmed(row: Mapping[str, Any], degc: Array | float) -> Array:
+    """What a drift row's regression adds to the value at 25 °C at another temperature."""
+    d = np.asarray(degc, dtype=float) - REFERENCE_DEGC
+    first, second, third = (row[c] or 0.0 for c in ("slope_per_degc", "curve_per_degc2", "curve_per_degc3"))
+    return np.asarray(first * d + second * d**2 + third * d**3)
+
+
+def predicted(row: Mapping[str, Any], degc: Array | float, days: Array | float) -> tuple[Array, Array]:
+    """Value and standard deviation of a drift row's regression at a temperature, so many days after its moment.
+
+    The value at 25 °C and the slope on temperature are correlated; they are independent at `best_known_degc`, B:
+    var(T) = sd² + s²[(T − B)² − (25 °C − B)²], s the slope's sd. So are the value and the slope in time at
+    `best_known_at`. Where one is not known the variances are added. Away from 25 °C and from the moment `as_of` at
+    once, the covariance of the two slopes is missing: ask along one of them.
+    """
+    degc, later = np.asarray(degc, dtype=float), np.asarray(days, dtype=float)
+    slope_sd = row["slope_per_degc_sd"] or 0.0
+    best = REFERENCE_DEGC if row["best_known_degc"] is None else row["best_known_degc"]
+    value = row["value_at_25degc"] + warmed(row, degc) + (row["slope_per_day"] or 0.0) * later
+    at_temperature = (row["sd"] or 0.0) ** 2 + slope_sd**2 * ((degc - best) ** 2 - (REFERENCE_DEGC - best) ** 2)
+    best_day = 0.0 if row["best_known_at"] is None else days_after([row["best_known_at"]], row["as_of"])[0]
+    in_time = (row["slope_per_day_sd"] or 0.0) ** 2 * ((later - best_day) ** 2 - best_day**2)
+    return np.asarray(value), np.sqrt(np.maximum(at_temperature + in_time, 0.0))
+
+
+def days_after(moments: list[datetime | None], reference: datetime) -> Array:
+    """Days from `reference`, (n,); NaN where the time is unknown."""
+    return np.array([np.nan if m is None else (m - reference).total_seconds() / DAY_S for m in moments])
+
+
+def fly_with_sentence(row: Mapping[str, Any]) -> str:
+    """Where a constant to fly with comes from: a row of `latest_calibration`."""
+    if row["source"] != "flight":
+        return str(row["why"])
+    at = "" if row["temperature_degc"] is None else f", {row['temperature_degc']:.0f} °C"
+    return f"Flight of {day(row['started_at'])}{at}. {row['why']}"

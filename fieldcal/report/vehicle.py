@@ -1,0 +1,332 @@
+"""A vehicle's page: what to fly with, the trends, every parameter's history, agreement, clock, flights and refusals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from fieldcal.errors import FieldcalError
+from fieldcal.report.history import as_of_sentence, newest, reason_of, unfold, usable_flights
+from fieldcal.report.links import Links, flight_name
+from fieldcal.report.page import Column, Folded, Heading, Notice, Page, Part, Section, Simple, Table, Text, badge
+from fieldcal.report.trend import STATUSES, change_sentence, fly_with_sentence, worst_status
+from fieldcal.report.vehicle_figures import MOST_POINTS, agreement_plot, lag_plot, parameter_plot
+from fieldcal.report.words import PARAMETERS, SENSORS, age, count, day, plain_name, preferred, scientific, unit
+from fieldcal.stages.warm_up import METHOD as WARM_UP
+from fieldcal.stages.warm_up import PARAMETER as WARM_UP_SLOPE
+from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.questions import existing
+from fieldcal.words.numbers import number
+
+FLIGHTS, REFUSALS, FEWEST_POINTS = 200, 100, 30
+OPEN = ("scale", "zero_bias", WARM_UP_SLOPE)
+"""Parameters whose plots are open; the others say the same in other words."""
+
+
+def vehicle_page(root: Path, vehicle_id: str, links: Links, as_of: datetime | None) -> Page:
+    """The page, from the history below `root`."""
+    warehouse = existing(root)
+    flights = (
+        warehouse.scan("flight", vehicle_id=vehicle_id).sort("started_at", "flight_id", nulls_last=False).collect()
+    )
+    if flights.is_empty():
+        raise FieldcalError("not_found", _no_vehicle(warehouse, vehicle_id))
+    moment = as_of or newest(warehouse)
+    imus = list(dict.fromkeys(reversed(flights["imu_id"].to_list())))
+    drift = warehouse.scan("drift").filter(pl.col("imu_id").is_in(imus)).collect()
+    current = drift.filter(pl.col("imu_id") == imus[0])
+    usable = usable_flights(warehouse, vehicle_id)
+    status = worst_status(current)
+    last = usable["started_at"][-1] if usable.height else None
+    facts = [
+        ("status", badge(status or "not analysed")),
+        ("latest verdict", badge(flights["verdict"][-1])),
+        ("last usable flight", "none" if usable.is_empty() else day(last)),
+        ("age", "–" if usable.is_empty() else age(last, moment)),
+        ("flights", f"{flights.height}, {usable.height} usable"),
+        ("IMU", imus[0] if len(imus) == 1 else f"{imus[0]}; before: {', '.join(imus[1:])}"),
+    ]
+    sections = [
+        Section("fly", "What to fly with", _fly_with(warehouse, imus[0])),
+        Section("trend", "Trends", _trends(current, usable.height)),
+        *_parameters(warehouse, vehicle_id, imus, drift),
+        Section("agreement", "Agreement", _agreement(warehouse, vehicle_id)),
+        Section("clock", "VPS clock", _clock(warehouse, vehicle_id)),
+        Section("flights", "Flights", [_flights(flights, usable, links)]),
+        Section("refusals", "Refusals", _refusals(warehouse, vehicle_id, links)),
+    ]
+    return Page(
+        f"Vehicle {vehicle_id}",
+        [as_of_sentence(moment, as_of is not None)],
+        facts,
+        sections,
+        "Written by fieldcal from its history tables; equal tables give an equal page.",
+        links.up(),
+    )
+
+
+def _no_vehicle(warehouse: Warehouse, vehicle_id: str) -> str:
+    from difflib import get_close_matches
+
+    known = sorted(warehouse.scan("flight").select(pl.col("vehicle_id").unique()).collect()["vehicle_id"].to_list())
+    near = get_close_matches(vehicle_id, known, n=3, cutoff=0.5) or known[:5]
+    there = f"there is {', '.join(near)}" if near else "the history is empty"
+    return f'No flight of a vehicle "{vehicle_id}" is in the history; {there}.'
+
+
+def _fly_with(warehouse: Warehouse, imu_id: str) -> list[Part]:
+    rows = warehouse.sql("SELECT * FROM latest_calibration WHERE imu_id = ?", [imu_id])
+    if rows.is_empty():
+        return [Notice("No flight gave a constant: there is nothing to fly with.")]
+    axes = sorted(rows["axis"].unique().to_list())
+    by_place: dict[tuple[str, str], dict[str, dict[str, Any]]] = {}
+    for r in rows.iter_rows(named=True):
+        by_place.setdefault((r["sensor"], r["parameter"]), {})[r["axis"]] = r
+    lines = []
+    for sensor, parameter in sorted(by_place, key=lambda p: (_place(SENSORS, p[0]), _place(PARAMETERS, p[1]), p)):
+        own = by_place[sensor, parameter]
+        values = [scientific(own[a]["value_at_25degc"], own[a]["sd"]) if a in own else "–" for a in axes]
+        any_axis = next(iter(own.values()))
+        methods = sorted({plain_name(r["method"]) for r in own.values()})
+        lines.append([f"{sensor} {parameter}", *values, unit(any_axis["unit"]), ", ".join(methods), _sources(own)])
+    columns = [
+        Column("parameter"),
+        *(Column(axis, "n") for axis in axes),
+        Column("unit"),
+        Column("method"),
+        Column("from", "wide"),
+    ]
+    return [
+        Text("z = scale · logged + bias, sensor axes. A constant of one flight holds at its temperature."),
+        Table("Latest constants at 25 °C, ± one standard deviation (view latest_calibration)", columns, lines),
+    ]
+
+
+def _sources(by_axis: Mapping[str, Mapping[str, Any]]) -> str:
+    """Where the constants of a parameter come from, axes of one source together."""
+    axes: dict[str, list[str]] = {}
+    for axis in sorted(by_axis):
+        axes.setdefault(fly_with_sentence(by_axis[axis]), []).append(axis)
+    if len(axes) == 1:
+        return next(iter(axes))
+    return " ".join(f"{', '.join(names)}: {source}" for source, names in axes.items())
+
+
+def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
+    if drift.is_empty():
+        return [
+            Notice(
+                f"Table drift has no row of this IMU ({count(usable, 'usable flight')}): trends are not analysed yet."
+            )
+        ]
+    parts: list[Part] = []
+    if set(drift["status"].to_list()) == {"insufficient"}:
+        told = f"Too few flights for a trend ({count(usable, 'usable flight')}): every status is insufficient."
+        why = {str(r["reason"]) for r in drift.iter_rows(named=True) if r["reason"]}
+        parts.append(Notice(" ".join([told, *sorted(why)])))
+    ordered = sorted(
+        drift.iter_rows(named=True),
+        key=lambda r: (
+            _place(SENSORS, r["sensor"]),
+            r["sensor"],
+            _place(PARAMETERS, r["parameter"]),
+            r["method"],
+            r["axis"],
+        ),
+    )
+    moving = [r for r in ordered if r["status"] not in ("stable", "insufficient")]
+    moving.sort(key=lambda r: _place(STATUSES, r["status"]))
+    counts = [f"{n} {status}" for status in STATUSES if (n := drift.filter(pl.col("status") == status).height)]
+    if moving:
+        columns = (
+            Column("parameter"),
+            Column("axis"),
+            Column("status"),
+            Column("why", "wide"),
+            Column("last flight, σ", "n"),
+        )
+        lines = [
+            [_name(r), r["axis"], badge(r["status"]), change_sentence(r, []), number(r["last_z"], 2)] for r in moving
+        ]
+        parts.append(Table("Parameters that are not steady, worst first", columns, lines))
+    elif not parts:
+        parts.append(Text("Every parameter with enough flights is steady."))
+    every = _trend_table("Regression over temperature and time", ordered)
+    return [*parts, Folded(f"All {len(ordered)} regressions: {', '.join(counts)}", [every])]
+
+
+def _name(row: Mapping[str, Any]) -> str:
+    return f"{plain_name(row['sensor'])} {row['parameter']} ({plain_name(row['method'])})"
+
+
+def _trend_table(caption: str, rows: list[dict[str, Any]]) -> Table:
+    columns = (
+        Column("parameter"),
+        Column("axis"),
+        Column("status"),
+        Column("flights", "n"),
+        Column("at 25 °C", "n"),
+        Column("per °C", "n"),
+        Column("per day", "n"),
+        Column("unit"),
+        Column("last flight, σ", "n"),
+        Column("step at", "nowrap"),
+    )
+    lines = [
+        [
+            _name(r),
+            r["axis"],
+            badge(r["status"]),
+            str(r["n_flights"]),
+            scientific(r["value_at_25degc"], r["sd"]),
+            scientific(r["slope_per_degc"], r["slope_per_degc_sd"]),
+            scientific(r["slope_per_day"], r["slope_per_day_sd"]),
+            unit(r["unit"]),
+            number(r["last_z"], 2),
+            "–" if r["change_at"] is None else day(r["change_at"]),
+        ]
+        for r in rows
+    ]
+    return Table(caption, columns, lines)
+
+
+def _parameters(warehouse: Warehouse, vehicle_id: str, imus: list[str], drift: pl.DataFrame) -> list[Section]:
+    """A section per sensor: the plots of its most exact method, the current IMU first."""
+    rows = (
+        warehouse.scan("calibration")
+        .filter(pl.col("imu_id").is_in(imus) & pl.col("value").is_not_null())
+        .sort("started_at", "flight_id", nulls_last=False)
+        .collect()
+    )
+    panels = max(3 * len(imus), rows.select("imu_id", "axis").unique().height)
+    most = max(FEWEST_POINTS, 3 * MOST_POINTS // panels)
+    sections: list[Section] = []
+    for sensor in sorted(rows["sensor"].unique().to_list(), key=lambda name: _place(SENSORS, name)):
+        parts: list[Part] = []
+        for imu in imus:
+            own = rows.filter(pl.col("sensor") == sensor, pl.col("imu_id") == imu)
+            if own.is_empty():
+                continue
+            if len(imus) > 1:
+                parts.append(Heading(f"IMU {imu}"))
+            parts += _sensor(own, drift.filter(pl.col("sensor") == sensor, pl.col("imu_id") == imu), vehicle_id, most)
+        sections.append(Section(f"sensor-{len(sections) + 1}", sensor.capitalize(), parts))
+    return sections
+
+
+def _sensor(rows: pl.DataFrame, drift: pl.DataFrame, vehicle_id: str, most: int) -> list[Part]:
+    methods = set(rows["method"].to_list())
+    shown = dict.fromkeys((preferred(methods), *(methods & {WARM_UP})))
+    return [part for method in shown for part in _method(rows, drift, method, vehicle_id, most)]
+
+
+def _method(rows: pl.DataFrame, drift: pl.DataFrame, method: str, vehicle_id: str, most: int) -> list[Part]:
+    rows = rows.filter(pl.col("method") == method)
+    sensor, imu = rows["sensor"][0], rows["imu_id"][0]
+    there = sorted(rows["parameter"].unique().to_list(), key=lambda name: (_place(PARAMETERS, name), name))
+    parts: list[Part] = [Text(f"Method: {plain_name(method)}.")]
+    folded: list[Simple] = []
+    for parameter in there:
+        own = rows.filter(pl.col("parameter") == parameter)
+        trend = drift.filter(pl.col("method") == method, pl.col("parameter") == parameter)
+        by_axis = {r["axis"]: r for r in trend.iter_rows(named=True) if r["status"] != "insufficient"}
+        anchor = f"plot-{_slug(sensor, parameter, imu)}"
+        plot = parameter_plot(own, by_axis, vehicle_id, f"{sensor} {parameter}", anchor, most)
+        (parts if parameter in OPEN else folded).append(plot)
+    if folded:
+        parts.append(Folded(f"The same as {' and '.join(p for p in there if p not in OPEN)}", folded))
+    return parts
+
+
+def _slug(*names: str) -> str:
+    """An id of the page's own from names that may be anything."""
+    import hashlib
+
+    return hashlib.sha256("\0".join(names).encode("utf-8", "surrogatepass")).hexdigest()[:10]
+
+
+def _agreement(warehouse: Warehouse, vehicle_id: str) -> list[Part]:
+    plot = agreement_plot(warehouse.scan("fit", vehicle_id=vehicle_id).collect(), "plot-agreement")
+    return [Text("No flight has anything to compare with.")] if plot is None else [plot]
+
+
+def _clock(warehouse: Warehouse, vehicle_id: str) -> list[Part]:
+    sync = warehouse.scan("sync", vehicle_id=vehicle_id).collect()
+    plot = lag_plot(sync, "plot-clock")
+    refused = sync.filter(pl.col("status") != "ok").height
+    parts: list[Part] = [Text("No flight was synchronised with a VPS.")] if plot is None else [plot]
+    return [*parts, Text(f"Synchronisation was refused in {count(refused, 'flight')}.")] if refused else parts
+
+
+def _flights(flights: pl.DataFrame, usable: pl.DataFrame, links: Links) -> Table:
+    columns = (
+        Column("flight"),
+        Column("started (UTC)", "nowrap"),
+        Column("session"),
+        Column("verdict"),
+        Column("usable"),
+        Column("duration, s", "n"),
+        Column("°C", "n"),
+        Column("log"),
+        Column("why", "wide"),
+    )
+    good = set(usable["flight_id"].to_list())
+    lines = [
+        [
+            links.to(flight_name(r["flight_id"]), r["flight_id"]),
+            day(r["started_at"]),
+            str(r["session_id"]),
+            badge(r["verdict"]),
+            "yes" if r["flight_id"] in good else "no",
+            "–" if r["duration_s"] is None else f"{r['duration_s']:.1f}",
+            "–" if r["temperature_mean_degc"] is None else f"{r['temperature_mean_degc']:.1f}",
+            str(r["log_uri"]),
+            r["reason"] or "; ".join(str(f["sentence"]) for f in unfold(r["findings"]) or [])[:300],
+        ]
+        for r in flights.reverse().head(FLIGHTS).iter_rows(named=True)
+    ]
+    more = (
+        f"{flights.height - FLIGHTS} earlier flights are not shown: fieldcal history."
+        if flights.height > FLIGHTS
+        else ""
+    )
+    return Table("Flights, the latest first (fieldcal report --flight ID writes a flight's page)", columns, lines, more)
+
+
+def _refusals(warehouse: Warehouse, vehicle_id: str, links: Links) -> list[Part]:
+    rows = warehouse.sql(
+        "SELECT * FROM refusals WHERE vehicle_id = ? AND level <> 'parameter'"
+        " ORDER BY started_at DESC NULLS LAST, flight_id, level, what",
+        [vehicle_id],
+    )
+    if rows.is_empty():
+        return [Text("Nothing was refused.")]
+    columns = (
+        Column("flight"),
+        Column("started (UTC)", "nowrap"),
+        Column("what"),
+        Column("status"),
+        Column("code"),
+        Column("why", "wide"),
+    )
+    lines = [
+        [
+            links.to(flight_name(r["flight_id"]), r["flight_id"]),
+            day(r["started_at"]),
+            f"{r['level']} {r['what']}",
+            badge(r["status"]),
+            r["reason_code"] or "",
+            reason_of(r),
+        ]
+        for r in rows.head(REFUSALS).iter_rows(named=True)
+    ]
+    more = f'{rows.height - REFUSALS} more: fieldcal sql "SELECT * FROM refusals".' if rows.height > REFUSALS else ""
+    return [Table(f"{count(rows.height, 'refusal')}, the latest first", columns, lines, more)]
+
+
+def _place(order: tuple[str, ...], name: str) -> int:
+    return order.index(name) if name in order else len(order)

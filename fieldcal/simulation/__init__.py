@@ -1,0 +1,1 @@
+"""The paper's experiment with known truth: arrays, and archives of logs."""

@@ -1,0 +1,209 @@
+"""Simulated flights as an archive of logs: `<vehicle>/<session>/<flight>` with a fieldcal.toml, and the truth beside
+each log."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal.config.configuration import parse
+from fieldcal.config.flight_settings import flight_settings
+from fieldcal.logs.mcap.write import pose_channel, raw_imu_channel, write_mcap
+from fieldcal.simulation.experiment import SENSORS, Experiment, Recording, constants_at, simulate
+from fieldcal.stages.tables import AXES, QUATERNION, columns_of, triad
+
+FIRST_FLIGHT = datetime(2026, 1, 12, 8, 0, tzinfo=UTC)
+LATENCY_NS = {"imu": 400_000, "vps": 4_800_000}
+
+
+def write_flights(
+    folder: Path,
+    experiment: Experiment | None = None,
+    *,
+    vehicles: int = 1,
+    sessions: int = 1,
+    flights: int = 1,
+    log_format: str = "mcap",
+) -> list[Path]:
+    """Write an archive of simulated flights and return the logs, sorted.
+
+    Vehicle 1 carries Tables 2–4's constants, the others are varied by a few per cent and a few hundred counts. Every
+    flight has its own seed (from `experiment.seed`), sessions are a week apart. Beside each log stand
+    `<flight>.truth.json` (constants at the flight's mean temperature, lag, rotations) and `<flight>.truth.parquet`
+    (attitude and rates as the sensors saw them).
+
+    Parameters
+    ----------
+    log_format : {"mcap", "csv"}
+        One MCAP file, or a folder with imu.csv and vps.csv.
+    """
+    if log_format not in ("mcap", "csv"):
+        raise ValueError(f'log_format is "mcap" or "csv", not {log_format!r}')
+    base = experiment or Experiment()
+    folder.mkdir(parents=True, exist_ok=True)
+    logs = []
+    described = []
+    for v in range(vehicles):
+        vehicle_id = f"sim-{v + 1}"
+        own = base if v == 0 else _varied(base, v)
+        described.append(_vehicle_table(vehicle_id, own))
+        for k in range(sessions):
+            day = FIRST_FLIGHT + timedelta(days=7 * k)
+            session = folder / vehicle_id / f"{day:%Y-%m-%d}"
+            session.mkdir(parents=True, exist_ok=True)
+            for i in range(flights):
+                seed = int(np.random.SeedSequence([base.seed, v, k, i]).generate_state(1)[0])
+                seed = base.seed if v == k == i == 0 else seed
+                recording = simulate(replace(own, seed=seed))
+                start = day + timedelta(minutes=20 * i)
+                logs.append(write_flight(session, f"flight-{i + 1:02d}", recording, start, log_format=log_format))
+    (folder / "fieldcal.toml").write_text("\n\n".join(described) + "\n", encoding="utf-8")
+    return sorted(logs)
+
+
+def _varied(e: Experiment, vehicle: int) -> Experiment:
+    """Another unit of the same type: scales ±3 %, zeros ±300 counts."""
+    rng = np.random.default_rng([e.seed, 77, vehicle])
+    scale: dict[str, tuple[float, float, float]] = {}
+    bias: dict[str, tuple[float, float, float]] = {}
+    for name in SENSORS:
+        old_scale, old_bias = np.array(e.scale[name]), np.array(e.bias[name])
+        zero = -old_bias / old_scale + rng.uniform(-300, 300, 3)
+        new = old_scale * (1 + rng.uniform(-0.03, 0.03, 3))
+        scale[name] = (float(new[0]), float(new[1]), float(new[2]))
+        offset = -new * zero
+        bias[name] = (float(offset[0]), float(offset[1]), float(offset[2]))
+    return replace(e, scale=scale, bias=bias)
+
+
+def _vehicle_table(vehicle_id: str, e: Experiment) -> str:
+    """What the night must be told of a simulated vehicle: everything that no log can say."""
+    polarity = {name: [int(np.sign(v)) for v in e.scale[name]] for name in SENSORS}
+    field = [float(np.cos(e.dip_rad)), 0.0, float(np.sin(e.dip_rad))]
+    lines = [
+        f'[vehicles."{vehicle_id}"]',
+        'world = "ned"',
+        'body = "frd"',
+        'gravity_sign = "gravity"',
+        f"gravity_mps2 = {e.gravity_mps2!r}",
+        f'field = {{ north_east_down = {field!r}, unit = "norm" }}',
+        "polarity = { " + ", ".join(f"{k} = {v!r}" for k, v in polarity.items()) + " }",
+        'units = { magnetometer = "counts", accelerometer = "counts", gyroscope = "counts" }',
+    ]
+    if any(e.lever_arm_m):
+        lines.append(f"lever_arm_m = {list(e.lever_arm_m)!r}")
+    return "\n".join(lines)
+
+
+def write_flight(folder: Path, name: str, r: Recording, start: datetime, *, log_format: str = "mcap") -> Path:
+    """Write one recording and its truth; returns the log (a file, or a folder of CSVs)."""
+    start_ns = int(start.timestamp()) * 1_000_000_000
+    t_ns = start_ns + np.rint(r.t * 1e9).astype(np.int64)
+    vps_ns = start_ns + np.rint(r.vps_t * 1e9).astype(np.int64)
+    if log_format == "mcap":
+        log = folder / f"{name}.mcap"
+        _write_mcap(log, r, t_ns, vps_ns, start_ns)
+    else:
+        log = folder / name
+        log.mkdir(exist_ok=True)
+        _write_csv(log, r)
+    (folder / f"{name}.truth.json").write_text(json.dumps(truth(r), indent=1) + "\n", encoding="utf-8")
+    pl.DataFrame(
+        {
+            "t_ns": t_ns if log_format == "mcap" else np.rint(r.t * 1e9).astype(np.int64),
+            **columns_of(r.q, QUATERNION),
+            **columns_of(r.rate, [f"rate_{a}_radps" for a in AXES]),
+        }
+    ).write_parquet(folder / f"{name}.truth.parquet")
+    return log
+
+
+def signals(r: Recording) -> dict[str, pl.DataFrame]:
+    """The recording as signal tables, as if its log had been read; stamps from 0."""
+    t_ns = np.rint(r.t * 1e9).astype(np.int64)
+    imu = np.hstack([r.counts["gyroscope"], r.counts["accelerometer"]])
+    out = {
+        "imu": pl.DataFrame({"t_ns": t_ns, **columns_of(imu, triad("gyroscope") + triad("accelerometer"))}),
+        "magnetometer": pl.DataFrame({"t_ns": t_ns, **columns_of(r.counts["magnetometer"], triad("magnetometer"))}),
+        "temperature": pl.DataFrame({"t_ns": t_ns, "temperature_degc": r.temperature}),
+    }
+    if len(r.vps_t):
+        pose = np.hstack([r.vps_q, r.vps_position])
+        vps_ns = np.rint(r.vps_t * 1e9).astype(np.int64)
+        out["vps"] = pl.DataFrame({"t_ns": vps_ns, **columns_of(pose, (*QUATERNION, "px_m", "py_m", "pz_m"))})
+    return out
+
+
+def settings(e: Experiment, vehicle_id: str = "sim-1", **changes: Any) -> dict[str, Any]:
+    """Flight settings of a simulated vehicle, as its fieldcal.toml gives them; `changes` replace parameters."""
+    vehicle = parse(_vehicle_table(vehicle_id, e), None).vehicle(vehicle_id)
+    return flight_settings(vehicle, units=dict.fromkeys(SENSORS, "counts")) | changes
+
+
+def _write_mcap(path: Path, r: Recording, t_ns: np.ndarray, vps_ns: np.ndarray, start_ns: int) -> None:
+    """Raw counts and VPS poses as ROS 2 messages; log times are the recorder's, stamps each device's own."""
+    counts = {k: v.astype(np.uint16) if r.experiment.quantisation else v for k, v in r.counts.items()}
+    channels = [
+        raw_imu_channel(
+            t_ns,
+            t_ns + LATENCY_NS["imu"],
+            counts["gyroscope"],
+            counts["accelerometer"],
+            counts["magnetometer"],
+            r.temperature,
+        )
+    ]
+    if len(r.vps_t):
+        e = r.experiment
+        seen = (r.vps_t - e.vps_offset_s) / (1 + 1e-6 * e.vps_skew_ppm)
+        seen_ns = start_ns + np.rint(seen * 1e9).astype(np.int64) + LATENCY_NS["vps"]
+        channels.append(pose_channel(vps_ns, seen_ns, r.vps_q, r.vps_position))
+    units = {f"unit_{name}": "counts" for name in SENSORS}
+    write_mcap(path, channels, metadata={**units, "world": "ned", "body": "frd", "gravity_sign": "gravity"})
+
+
+def _write_csv(folder: Path, r: Recording) -> None:
+    """imu.csv and vps.csv under the default column names, time in seconds from the start, every digit that counts."""
+    kind = pl.UInt16 if r.experiment.quantisation else pl.Float64
+    names = {"gyroscope": "g", "accelerometer": "a", "magnetometer": "m"}
+    imu = {f"{short}{axis}": r.counts[name][:, i] for name, short in names.items() for i, axis in enumerate(AXES)}
+    frame = pl.DataFrame({k: pl.Series(v).cast(kind) for k, v in imu.items()})
+    frame.insert_column(0, _seconds("t_s", r.t))
+    frame.with_columns(temp=pl.Series(np.round(r.temperature, 4))).write_csv(folder / "imu.csv")
+    if len(r.vps_t):
+        vps = pl.DataFrame({**columns_of(r.vps_q, QUATERNION), **columns_of(r.vps_position, ("px", "py", "pz"))})
+        vps.insert_column(0, _seconds("t_s", r.vps_t)).write_csv(folder / "vps.csv")
+
+
+def _seconds(name: str, t: np.ndarray) -> pl.Series:
+    """Seconds as text with nine digits: whole nanoseconds, as a recorder writes them."""
+    return pl.Series(name, np.rint(t * 1e9).astype(np.int64)).cast(pl.Decimal(18, 0)).cast(pl.Decimal(38, 9)) / 10**9
+
+
+def truth(r: Recording) -> dict[str, Any]:
+    """What a calibration of this recording should find, plain JSON."""
+    temperature = float(np.mean(r.temperature))
+    constants = {}
+    for name in SENSORS:
+        scale, bias = constants_at(r.experiment, name, temperature)
+        constants[name] = {"scale": scale.tolist(), "bias": bias.tolist(), "zero": (-bias / scale).tolist()}
+    e = r.experiment
+    return {
+        "temperature_degc": temperature,
+        "constants": constants,
+        "lag_s": r.lag_s,
+        "skew_ppm": e.vps_skew_ppm,
+        "sensor_delay_s": r.delay_s,
+        "vps_world_rotation_xyzw": r.vps_world_rotation.tolist(),
+        "vps_body_rotation_xyzw": r.vps_body_rotation.tolist(),
+        "lever_arm_m": list(e.lever_arm_m),
+        "dip_rad": e.dip_rad,
+        "translation_rms_mps2": e.translation_rms_mps2,
+        "seed": e.seed,
+    }

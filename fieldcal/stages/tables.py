@@ -1,0 +1,90 @@
+"""Columns ↔ arrays: how polars tables of signals, samples and results become numpy and back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fieldcal.geometry.rotation import Array
+
+AXES = ("x", "y", "z")
+QUATERNION = ("qx", "qy", "qz", "qw")
+
+
+def triad(name: str, prefix: str = "") -> list[str]:
+    """Column names of a triad: gyroscope → gyroscope_x, …"""
+    return [f"{prefix}{name}_{axis}" for axis in AXES]
+
+
+def matrix(table: pl.DataFrame, columns: Sequence[str]) -> Array:
+    """Columns as (n, m) float64; nulls become NaN."""
+    return np.column_stack([table[c].to_numpy() for c in columns]).astype(np.float64, copy=False)
+
+
+def seconds(t_ns: pl.Series, origin_ns: int) -> Array:
+    """Stamps as float64 seconds from `origin_ns` (subtracted as integers first)."""
+    return (t_ns.to_numpy() - origin_ns) * 1e-9
+
+
+def columns_of(array: Array, names: Sequence[str]) -> dict[str, Array]:
+    """(n, m) array as named columns."""
+    return {name: np.ascontiguousarray(array[:, i]) for i, name in enumerate(names)}
+
+
+def calibration_rows(rows: list[dict[str, Any]]) -> pl.DataFrame:
+    """Rows of the `calibration` table as a stage writes it."""
+    return pl.DataFrame(
+        rows,
+        schema={
+            "sensor": pl.String,
+            "method": pl.String,
+            "parameter": pl.String,
+            "axis": pl.String,
+            "value": pl.Float64,
+            "sd": pl.Float64,
+            "unit": pl.String,
+            "temperature_degc": pl.Float64,
+            "status": pl.String,
+            "reason_code": pl.String,
+        },
+    )
+
+
+def covariance_table(covariance: Array) -> pl.DataFrame:
+    """A (p, p) covariance as rows (row, column, value)."""
+    row, column = np.indices(covariance.shape)
+    return pl.DataFrame(
+        {
+            "row": row.ravel().astype(np.int32),
+            "column": column.ravel().astype(np.int32),
+            "value": np.ascontiguousarray(covariance).ravel(),
+        }
+    )
+
+
+def covariance_of(table: pl.DataFrame) -> Array:
+    """The (p, p) covariance of `covariance_table`'s rows."""
+    size = round(len(table) ** 0.5)
+    return np.asarray(table.sort("row", "column")["value"].to_numpy().reshape(size, size))
+
+
+def constants(
+    calibration: pl.DataFrame, sensor: str, method: str | None = None, *, refused_too: bool = False
+) -> tuple[Array, Array] | None:
+    """(Λ (3, 3), b (3,)) of a sensor from `calibration` rows; None where there are none, or (normally) one is
+    refused."""
+    rows = calibration.filter(pl.col("sensor") == sensor)
+    if method is not None:
+        rows = rows.filter(pl.col("method") == method)
+    if rows.is_empty() or (not refused_too and (rows["status"] != "ok").any()):
+        return None
+    value = {(p, a): v for p, a, v in rows.select("parameter", "axis", "value").iter_rows()}
+    bias = np.array([value["bias", a] for a in AXES])
+    if ("scale", "xy") in value:
+        scale = np.array([[value["scale", r + c] for c in AXES] for r in AXES])
+    else:
+        scale = np.diag([value["scale", a] for a in AXES])
+    return scale, bias

@@ -1,0 +1,1 @@
+"""What many flights say: drift over temperature and time, steps, odd siblings."""

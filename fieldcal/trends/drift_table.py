@@ -1,0 +1,264 @@
+"""The table `drift`: read the history of all vehicles, regress, compare siblings, publish what changed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from fieldcal.schemas import TABLES
+from fieldcal.stages.run_key import code_digest
+from fieldcal.trends import few_sessions, regression, siblings
+from fieldcal.trends.curves import Bends, Bent, bends_of, bent
+from fieldcal.trends.evidence_cache import Memory
+from fieldcal.trends.reasons import AGREEMENT, VPS, reason
+from fieldcal.trends.series import ENOUGH_SESSIONS, Histories
+from fieldcal.trends.warm_up_slopes import known_slopes
+from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.layout import history_files, vehicle_of
+from fieldcal.warehouse.publish import publish
+from fieldcal.warehouse.questions import existing
+from fieldcal.warehouse.store import empty_frame, read_table
+
+KEY = ["imu_id", "sensor", "method", "parameter", "axis"]
+ALIKE = ("sensor", "method", "parameter", "unit")
+SIBLINGS = (*ALIKE, "axis")
+SIGNED = ("scale", "bias", "zero_bias")
+"""Parameters whose sign follows the polarity of the axis: siblings may be mounted the other way round."""
+NO_BENDS: Bends = {}
+DAY_US = 86_400_000_000
+ATTEMPTS = 10
+
+
+def update_drift(root: Path) -> tuple[str, ...]:
+    """Publish the trends of every IMU under the vehicle that carries it now; the vehicles whose table changed.
+
+    A function of the history alone: the same history gives the same bytes, and then nothing is written. IMUs whose
+    history did not change are not regressed again (`evidence_cache`); the fleet is judged anew from all. When another
+    process publishes flights meanwhile, it is done again, so that whoever ends last leaves the trends of all.
+
+    Raises
+    ------
+    WarehouseError
+        As `fieldcal.warehouse.publish.publish`.
+    """
+    changed: set[str] = set()
+    for _ in range(ATTEMPTS):
+        before = _state(root)
+        memory = Memory(root, code_digest())
+        table = drift_table(root, memory)
+        memory.save()
+        for vehicle_id in sorted(set(table["vehicle_id"].to_list()) | _with_drift(root)):
+            if publish(root, vehicle_id, {"drift": table.filter(pl.col("vehicle_id") == vehicle_id)}, ()):
+                changed.add(vehicle_id)
+        if _state(root) == before:
+            break
+    return tuple(sorted(changed))
+
+
+def drift_table(root: Path, memory: Memory | None = None) -> pl.DataFrame:
+    """The table `drift` as the history has it now; nothing is written."""
+    return table_of(history_of_everything(root), bends_of(root), memory)
+
+
+def table_of(flights: pl.DataFrame, bends: Bends = NO_BENDS, memory: Memory | None = None) -> pl.DataFrame:
+    """The table `drift` of `history_of_everything`'s rows and of `bends_of`'s curves."""
+    if flights.is_empty():
+        return empty_frame("drift")
+    rows, trends, borrowed = trends_of(flights, bends, memory or Memory())
+    group, kind, value, sd = _siblings(rows, trends)
+    stepped, drifting = regression.moving(trends)
+    fleet_z, fleet_p = siblings.sibling_distance(group, value, sd, doubtful=stepped | drifting, kind=kind)
+    result = rows.with_columns(
+        **{
+            name: pl.Series(np.asarray(column, dtype=float), nan_to_null=True)
+            for name, column in {
+                "value_at_25degc": trends.value,
+                "sd": trends.sd,
+                "slope_per_degc": trends.slope_per_degc,
+                "slope_per_degc_sd": trends.slope_per_degc_sd,
+                "slope_per_day": trends.slope_per_day,
+                "slope_per_day_sd": trends.slope_per_day_sd,
+                "last_z": trends.last_z,
+                "best_known_degc": trends.best_degc,
+                "session_sd": trends.session_sd,
+                "change_size": trends.change_size,
+                "change_size_sd": trends.change_size_sd,
+                "fleet_z": fleet_z,
+            }.items()
+        },
+        borrowed_from=pl.Series(borrowed, nan_to_null=True).cast(pl.Int64),
+        n_flights=pl.Series(trends.n_flights).cast(pl.Int64),
+        n_sessions=pl.Series(trends.n_sessions).cast(pl.Int64),
+        change_at=_moments(trends.change_day),
+        best_known_at=_moments(trends.best_day),
+        status=pl.Series(regression.statuses(trends, fleet_p).tolist(), dtype=pl.String),
+    )
+    told = result.with_columns(reason=pl.Series([reason(row) for row in result.iter_rows(named=True)], dtype=pl.String))
+    return told.select(TABLES["drift"].column_names).sort(KEY)
+
+
+def history_of_everything(root: Path) -> pl.DataFrame:
+    """Values that were not refused: calibrated parameters, the VPS clock's lag and skew, Theil's coefficients.
+
+    One row a flight and series, sorted by series and time. A series keeps to the unit of its last flight, and to
+    flights with a time where any has one.
+    """
+    warehouse = Warehouse(root)
+    lead = ["vehicle_id", "imu_id", "session_id", "flight_id", "started_at"]
+    columns = [*lead, "sensor", "method", "parameter", "axis", "value", "sd", "unit", "temperature_degc"]
+    calibration = warehouse.scan("calibration").filter(pl.col("status") == "ok").select(columns)
+    warm = warehouse.scan("flight").select("vehicle_id", "flight_id", temperature_degc="temperature_mean_degc")
+    text = {"sensor": pl.lit(VPS), "method": pl.lit("sync"), "axis": pl.lit("")}
+    flight = ["vehicle_id", "flight_id"]
+    sync = warehouse.scan("sync").filter(pl.col("status") == "ok").join(warm, on=flight, how="left")
+    clock = [
+        sync.with_columns(**text, parameter=pl.lit(name), value=value, sd=sd, unit=pl.lit(unit)).select(columns)
+        for name, value, sd, unit in (
+            ("lag", pl.col("lag_mid_s"), pl.col("lag_sd_s"), "s"),
+            ("skew", pl.col("skew_ppm"), pl.col("skew_sd_ppm"), "ppm"),
+        )
+    ]
+    fit = (
+        warehouse.scan("fit")
+        .filter((pl.col("signal") == "raw") & (pl.col("sample") == "all"))
+        .join(warm, on=flight, how="left")
+        .with_columns(
+            sensor=pl.lit(AGREEMENT),
+            parameter=pl.concat_str(pl.lit("tic_"), pl.col("quantity")),
+            axis=pl.col("reference"),
+            value=pl.col("tic"),
+            sd=pl.lit(None, dtype=pl.Float64),
+            unit=pl.lit("1"),
+        )
+        .select(columns)
+    )
+    rows = pl.concat([calibration, *clock, fit]).filter(pl.col("value").is_finite()).collect()
+    timed = pl.col("started_at").is_not_null()
+    order = [*KEY, "started_at", "vehicle_id", "flight_id"]
+    return (
+        rows.sort(order, nulls_last=False)
+        .filter((pl.col("unit") == pl.col("unit").last().over(KEY)) & (timed | ~timed.any().over(KEY)))
+        .sort(order, nulls_last=False)
+    )
+
+
+def trends_of(
+    flights: pl.DataFrame, bends: Bends, memory: Memory
+) -> tuple[pl.DataFrame, regression.Trends, np.ndarray]:
+    """(one row a series with what is the same throughout it, its trends, how many siblings lent to it) of
+    `history_of_everything`'s rows."""
+    numbered = flights.with_columns(row=pl.struct(KEY).rle_id())
+    kept = Histories(
+        row=numbered["row"].to_numpy().astype(np.int64),
+        session=flights.select(pl.struct("vehicle_id", "session_id").rank("dense"))
+        .to_series()
+        .to_numpy()
+        .astype(np.int64),
+        time_day=flights["started_at"].dt.timestamp("us").cast(pl.Float64).to_numpy() / DAY_US,
+        temperature_degc=flights["temperature_degc"].to_numpy(),
+        value=flights["value"].to_numpy(),
+        sd=flights["sd"].to_numpy(),
+    )
+    rows = numbered.group_by("row", maintain_order=True).agg(
+        *(pl.col(name).last() for name in (*KEY, "vehicle_id", "unit")),
+        temperature_min_degc=pl.col("temperature_degc").min(),
+        temperature_max_degc=pl.col("temperature_degc").max(),
+    )
+    kept = replace(kept, kind=_labels(rows, ALIKE))
+    imu = rows["imu_id"].rle_id().to_numpy()
+    trends = regression.judge(memory.of(kept, imu), kept.kind)
+    curves = bent(flights, kept, rows, trends, bends)
+    if (known := known_slopes(flights, kept, rows, trends)) is not None:
+        slope, slope_sd = known
+        if curves is not None:
+            is_bent = np.isfinite(curves.bend).all(axis=1)
+            kept = curves.histories
+            slope, slope_sd = np.where(is_bent, curves.slope, slope), np.where(is_bent, curves.slope_sd, slope_sd)
+        with_slopes = replace(kept, slope_per_degc=slope, slope_per_degc_sd=slope_sd)
+        trends = regression.judge(memory.of(with_slopes, imu), kept.kind)
+        trends = trends if curves is None else curves.widened(trends)
+    rows = _with_curves(rows, curves)
+    # A flight set aside is not what the line is as of.
+    last = numbered.filter(pl.Series(trends.kept)).group_by("row").agg(as_of=pl.col("started_at").last())
+    rows = rows.join(last, on="row", how="left", maintain_order="left")
+    stepped, drifting = regression.moving(trends)
+    steady = (trends.n_sessions >= ENOUGH_SESSIONS) & ~stepped & ~drifting
+    return rows, *few_sessions.borrow(kept, trends, _labels(rows, SIBLINGS), _sign(rows, trends), steady)
+
+
+def _with_curves(rows: pl.DataFrame, curves: Bent | None) -> pl.DataFrame:
+    nothing = np.full((len(rows), 2), np.nan)
+    bend, sd = (nothing, nothing) if curves is None else (curves.bend, curves.bend_sd)
+    columns = {f"curve_per_degc{i + 2}{s}": a[:, i] for i in (0, 1) for s, a in (("", bend), ("_sd", sd))}
+    return rows.with_columns(**{name: pl.Series(column, nan_to_null=True) for name, column in columns.items()})
+
+
+def _sign(rows: pl.DataFrame, trends: regression.Trends) -> np.ndarray:
+    """−1 (g,) where a row's sign follows its scale's and that is negative, else 1."""
+    axis = ["imu_id", "sensor", "method", "axis"]
+    table = rows.select(*axis, "parameter", value=pl.Series(trends.value))
+    scale = table.filter(pl.col("parameter") == "scale").select(*axis, sign=pl.col("value").sign())
+    sign = table.join(scale, on=axis, how="left", maintain_order="left")["sign"].fill_null(1.0).to_numpy()
+    return np.where(rows["parameter"].is_in(SIGNED).to_numpy(), sign, 1.0)
+
+
+def _siblings(rows: pl.DataFrame, trends: regression.Trends) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(group (g,), kind, value, sd) that siblings are compared by. Too short histories are groups of their own; groups
+    that differ in the axis alone are of a kind.
+
+    A VPS clock's lag is arbitrary, its scatter from session to session is not: there the logarithm of the scatter."""
+    value, sd = _sign(rows, trends) * trends.value, trends.sd
+    clock = (rows["sensor"] == VPS).to_numpy()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scatter = np.log(trends.session_sd + trends.flight_sd + trends.sd)
+        scatter_sd = 1.0 / np.sqrt(2.0 * np.maximum(trends.n_sessions - 1, 1))
+    value, sd = np.where(clock, scatter, value), np.where(clock, scatter_sd, sd)
+    group, kind = (_labels(rows, columns).astype(np.int64) for columns in (SIBLINGS, ALIKE))
+    alone = (trends.n_sessions < ENOUGH_SESSIONS) | ~np.isfinite(value) | ~np.isfinite(sd)
+    for label in (group, kind):
+        label[alone] = label.max() + 1 + np.arange(alone.sum())
+    return group, kind, np.where(alone, 0.0, value), np.where(alone, 1.0, sd)
+
+
+def _labels(rows: pl.DataFrame, columns: tuple[str, ...]) -> np.ndarray:
+    """A number (g,) for each row, the same where `columns` are."""
+    return rows.select(pl.struct(*columns).rank("dense")).to_series().to_numpy()
+
+
+def _moments(day: np.ndarray) -> pl.Series:
+    """Days since 1970 as moments, to the microsecond; NaN becomes null."""
+    exact = [None if np.isnan(d) else round(float(d) * DAY_US) for d in day]
+    return pl.Series(exact, dtype=pl.Int64).cast(pl.Datetime("us", "UTC"))
+
+
+def _state(root: Path) -> list[tuple[str, int, int, int]]:
+    """What the files of the history are; they are replaced whole, so another content is another file."""
+    files = [path for table in ("calibration", "flight", "run", "sync", "fit") for path in history_files(root, table)]
+    return [(str(path), (s := path.stat()).st_ino, s.st_size, s.st_mtime_ns) for path in files]
+
+
+def _with_drift(root: Path) -> set[str]:
+    """Vehicles that have a table already."""
+    found: set[str] = set()
+    for path in history_files(root, "drift"):
+        vehicle_id = vehicle_of(path)
+        if vehicle_id is None:
+            found |= set(read_table(path, "drift")["vehicle_id"].to_list())
+        else:
+            found.add(vehicle_id)
+    return found
+
+
+def drift_rows(root: Path, vehicle: str | None, sensor: str | None, parameter: str | None) -> pl.DataFrame:
+    """Rows of the table as it was published, what is not stable first."""
+    rows = existing(root).scan("drift", vehicle_id=vehicle)
+    for column, wanted in (("sensor", sensor), ("parameter", parameter)):
+        if wanted is not None:
+            rows = rows.filter(pl.col(column) == wanted)
+    rank = pl.col("status").replace_strict(
+        {"step": 0, "drifting": 1, "outlier": 2, "stable": 3, "insufficient": 4}, default=5, return_dtype=pl.Int8
+    )
+    return rows.sort([rank, *KEY]).collect()

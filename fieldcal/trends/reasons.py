@@ -1,0 +1,45 @@
+"""Why a row of `drift` has its status, in a sentence with the numbers that decided it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fieldcal.trends.series import ENOUGH_SESSIONS
+from fieldcal.words.numbers import number, with_sd
+
+VPS, AGREEMENT = "vps", "fit"
+"""What stands as `sensor` of rows about the VPS clock and about agreement (Theil's coefficients)."""
+UNCONFIRMED_SIGMAS = 5.0
+"""Distance of the last flight from the line beyond which it may be the first after a step."""
+
+
+def reason(row: Mapping[str, Any]) -> str | None:
+    """The sentence; None for a stable row whose last flight lies where it should."""
+    unit = "" if row["unit"] in (None, "1") else f" {row['unit']}"
+    if row["status"] == "insufficient":
+        sessions = row["n_sessions"]
+        told = f"{sessions} session{'' if sessions == 1 else 's'}: a trend needs {ENOUGH_SESSIONS}."
+        if row["borrowed_from"] is None:
+            return told
+        lent = f"scatter between sessions ({number(row['session_sd'])}{unit}) and slope are those of"
+        return f"{told} The value is the sessions' mean; {lent} {row['borrowed_from']} siblings."
+    if row["status"] == "step":
+        size = with_sd(row["change_size"], row["change_size_sd"])
+        return f"Stepped by {size}{unit} before the flight of {row['change_at']:%Y-%m-%d %H:%M} UTC."
+    if row["status"] == "drifting":
+        slope = with_sd(row["slope_per_day"], row["slope_per_day_sd"])
+        return f"Moves by {slope}{unit} a day, {_sigmas(row['slope_per_day'], row['slope_per_day_sd'])} sd from none."
+    if row["status"] == "outlier":
+        what = "Its scatter between sessions" if row["sensor"] == "vps" else number(row["value_at_25degc"]) + unit
+        return f"{what} is {row['fleet_z']:+.1f} sd from the fleet's other IMUs."
+    if row["last_z"] is not None and abs(row["last_z"]) > UNCONFIRMED_SIGMAS:
+        return (
+            f"The last flight is {row['last_z']:+.1f} sd off the line: spoiled, or the first after a step. Another"
+            " session will tell."
+        )
+    return None
+
+
+def _sigmas(value: float, sd: float) -> str:
+    return f"{abs(value) / sd:.1f}" if sd else "many"

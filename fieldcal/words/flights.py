@@ -1,0 +1,57 @@
+"""What became of a flight, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fieldcal.words.numbers import number, with_sd
+
+QUANTITIES = {
+    "attitude": "attitude",
+    "quaternion_rate": "quaternion rate",
+    "attitude_propagated": "integrated attitude",
+    "body_rate": "body rate",
+}
+Rows = Sequence[Mapping[str, Any]]
+
+
+def verdict_sentence(flight: Mapping[str, Any]) -> str:
+    """What became of the log, in a line."""
+    head = f"{flight['log_uri']} ({flight['vehicle_id']}, flight {flight['flight_id']}): {flight['verdict']}"
+    if flight["verdict"] in ("ok", "partial"):
+        rates = f"{flight['duration_s']:.1f} s, IMU at {flight['imu_rate_hz']:.0f} Hz"
+        if flight["vps_rate_hz"]:
+            rates += f", VPS at {flight['vps_rate_hz']:.0f} Hz"
+        if flight["temperature_mean_degc"] is not None:
+            rates += f", {flight['temperature_mean_degc']:.1f} °C"
+        head += f"; {rates}"
+    return head + (f"\n  {flight['reason']}" if flight["reason"] else "")
+
+
+def advised(runs: Rows) -> list[str]:
+    """What would make weak constants better, by the stages that found them (a refused stage says it in its reason)."""
+    return [run["measured"]["advice"] for run in runs if run["status"] == "ok" and run["measured"].get("advice")]
+
+
+def is_consequence(run: Mapping[str, Any]) -> bool:
+    """Whether a stage stopped only because another stage gave it nothing: `no_` and one of the tables that it needs.
+
+    The same code is a cause where a stage finds it in the log itself: equation error's `no_gyroscope`."""
+    from fieldcal.stages.pipeline import PIPELINE
+
+    code, stage = str(run["reason_code"]), next((s for s in PIPELINE if s.name == run["stage"]), None)
+    needs = () if stage is None else (need for need in stage.needs if not stage.reads[need].startswith("ingest."))
+    wanting = code in ("no_samples", "no_manoeuvre") or code in [f"no_{need}" for need in needs]
+    return bool(run["status"] == "refused" and wanting)
+
+
+def sync_sentence(sync: Mapping[str, Any]) -> str:
+    """The clocks in a line."""
+    if sync["status"] != "ok":
+        return f"VPS clock: {sync['status']}; peak {number(sync['peak'], 3)}, next best {number(sync['runner_up'], 3)}"
+    return (
+        f"VPS clock: lag {sync['lag_s']:+.5f} s at the first IMU sample (VPS clock + lag = IMU clock), "
+        f"{with_sd(sync['lag_mid_s'], sync['lag_sd_s'])} s at mid-flight, drift "
+        f"{with_sd(sync['skew_ppm'], sync['skew_sd_ppm'])} ppm, correlation peak {number(sync['peak'], 4)}"
+    )

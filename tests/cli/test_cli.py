@@ -1,0 +1,220 @@
+"""The command line as a user meets it: documents, exit codes, sentences."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fieldcal import schemas
+from fieldcal.cli.main import run
+from fieldcal.simulation.archive import write_flights
+from fieldcal.simulation.experiment import Experiment
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cli") / "archive"
+    write_flights(folder, Experiment(seed=5, duration_s=25.0))
+    (folder / "sim-1" / "2026-01-12" / "empty.mcap").write_bytes(b"")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def log(archive: Path) -> Path:
+    return archive / "sim-1" / "2026-01-12" / "flight-01.mcap"
+
+
+@pytest.fixture(scope="module")
+def warehouse(archive: Path, tmp_path_factory: pytest.TempPathFactory, prefect_server: str) -> Path:
+    root = tmp_path_factory.mktemp("cli") / "warehouse"
+    assert run(["nightly", str(archive), "--warehouse", str(root)]) == 3
+    return root
+
+
+def document(capsys: pytest.CaptureFixture[str], *tokens: str, code: int = 0) -> Any:
+    """stdout of a command as JSON."""
+    capsys.readouterr()
+    assert run(tokens) == code
+    return json.loads(capsys.readouterr().out)
+
+
+def sentence(capsys: pytest.CaptureFixture[str], *tokens: str, code: int) -> str:
+    """What a failing command says: one line on stderr, nothing on stdout."""
+    capsys.readouterr()
+    assert run(tokens) == code
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.count("\n") == 1
+    assert "Traceback" not in told.err
+    return told.err
+
+
+def test_help_is_quick_and_names_the_commands() -> None:
+    began = time.monotonic()
+    told = subprocess.run([sys.executable, "-m", "fieldcal", "--help"], cwd=REPOSITORY, capture_output=True, text=True)
+    assert time.monotonic() - began < 1.5
+    for name in ("demo", "calibrate", "nightly", "session", "history", "sql", "simulate", "verify"):
+        assert name in told.stdout
+
+
+def test_help_imports_nothing_heavy() -> None:
+    program = (
+        "import sys; from fieldcal.cli.main import app; "
+        "print([m for m in ('prefect', 'polars', 'scipy') if m in sys.modules])"
+    )
+    told = subprocess.run([sys.executable, "-c", program], cwd=REPOSITORY, capture_output=True, text=True)
+    assert told.stdout == "[]\n"
+
+
+def test_calibrate_prints_the_tables_as_one_document(capsys: pytest.CaptureFixture[str], log: Path) -> None:
+    found = document(capsys, "calibrate", str(log), "--json")
+    assert list(found) == ["flight", "calibration", "fit", "sync", "run"]
+    for name in ("flight", "sync"):
+        assert set(found[name]) == {column.name for column in schemas.table_columns(name)}
+    for name in ("calibration", "fit", "run"):
+        assert set(found[name][0]) == {column.name for column in schemas.table_columns(name)}
+    assert found["flight"]["vehicle_id"] == "sim-1"
+    assert found["flight"]["session_id"] == "2026-01-12"
+    truth = json.loads(log.with_name("flight-01.truth.json").read_text())
+    scale = [
+        row["value"] for row in found["calibration"] if (row["sensor"], row["parameter"]) == ("magnetometer", "scale")
+    ]
+    assert scale == pytest.approx(truth["constants"]["magnetometer"]["scale"], rel=0.1)
+    assert found["sync"]["lag_s"] == pytest.approx(truth["lag_s"], abs=0.005)
+
+
+def test_calibrate_shows_a_table_to_people(capsys: pytest.CaptureFixture[str], log: Path) -> None:
+    capsys.readouterr()
+    assert run(["calibrate", str(log)]) == 0
+    told = capsys.readouterr().out
+    for word in ("ok", "magnetometer", "gyroscope", "±", "TIC", "VPS clock: lag"):
+        assert word in told
+
+
+def test_calibrate_says_what_the_night_says(capsys: pytest.CaptureFixture[str], log: Path, warehouse: Path) -> None:
+    alone = document(capsys, "calibrate", str(log), "--json")
+    query = "SELECT sensor, method, parameter, axis, value, sd FROM calibration"
+    night = document(capsys, "sql", query, "--json", "--warehouse", str(warehouse))
+    keys = list(night[0])
+    assert sorted(map(str, night)) == sorted(str({key: row[key] for key in keys}) for row in alone["calibration"])
+
+
+def test_parameters_can_be_overruled(capsys: pytest.CaptureFixture[str], log: Path) -> None:
+    own = document(capsys, "calibrate", str(log), "--json", "--profile", "onboard", "--set", "ellipsoid=li")
+    assert {row["method"] for row in own["calibration"]} == {"ellipsoid", "equation_error"}
+
+
+def test_a_rejected_log_is_told_and_ends_in_3(capsys: pytest.CaptureFixture[str], archive: Path) -> None:
+    found = document(capsys, "calibrate", str(archive / "sim-1/2026-01-12/empty.mcap"), "--json", code=3)
+    assert found["flight"]["verdict"] == "rejected"
+    assert found["flight"]["reason_code"] == "empty_file"
+    assert (found["calibration"], found["fit"], found["sync"]) == ([], [], None)
+
+
+def test_the_night_as_json(capsys: pytest.CaptureFixture[str], archive: Path, warehouse: Path) -> None:
+    found = document(capsys, "nightly", str(archive), "--warehouse", str(warehouse), "--json", code=3)
+    counts = {"ok", "partial", "quarantined", "rejected", "stages_run", "stages_cached", "seconds", "logs"}
+    assert set(found) - counts == {"stage_seconds", "server_seconds", "changes", "report"}
+    assert (found["ok"], found["rejected"], found["stages_run"]) == (1, 1, 0)
+    assert {"log_uri", "flight_id", "verdict", "reason_code", "reason"} <= set(found["logs"][0])
+    planned = document(
+        capsys, "session", str(archive / "sim-1/2026-01-12"), "--warehouse", str(warehouse), "--dry-run", "--json"
+    )
+    assert (planned["stages_to_run"], len(planned["logs"])) == (0, 2)
+
+
+def test_the_history_in_three_forms(capsys: pytest.CaptureFixture[str], warehouse: Path) -> None:
+    asked = ["history", "--warehouse", str(warehouse), "--sensor", "gyroscope", "--parameter", "scale"]
+    rows = document(capsys, *asked, "--json")
+    assert {row["axis"] for row in rows} == {"x", "y", "z"}
+    assert {row["sensor"] for row in rows} == {"gyroscope"}
+    run([*asked, "--csv"])
+    listed = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert [float(row["value"]) for row in listed] == [row["value"] for row in rows]
+    assert document(capsys, *asked, "--json", "--since", "2026-02-01") == []
+    assert document(capsys, *asked, "--json", "--vehicle", "nobody") == []
+    assert run(asked) == 0
+    assert "gyroscope" in capsys.readouterr().out
+
+
+def test_sql_reads_and_nothing_else(capsys: pytest.CaptureFixture[str], warehouse: Path) -> None:
+    at = ("--warehouse", str(warehouse))
+    assert document(capsys, "sql", "SELECT count(*) AS n FROM flight", "--json", *at) == [{"n": 2}]
+    assert "read" in sentence(capsys, "sql", "DROP TABLE flight", *at, code=2)
+    assert "flihgt" in sentence(capsys, "sql", "SELECT * FROM flihgt", *at, code=2)
+
+
+def test_verify_finds_a_flipped_bit(capsys: pytest.CaptureFixture[str], warehouse: Path, archive: Path) -> None:
+    at = ("--warehouse", str(warehouse), "--json")
+    sound = document(capsys, "verify", "--archive", str(archive), *at)
+    assert sound["ok"]
+    path = next((warehouse / "signals" / "imu").rglob("*.parquet"))
+    data = path.read_bytes()
+    path.write_bytes(data[:1000] + bytes([data[1000] ^ 1]) + data[1001:])
+    try:
+        assert len(document(capsys, "verify", *at, code=1)["damaged"]) == 1
+    finally:
+        path.write_bytes(data)
+    assert sound["content_sha256"] == document(capsys, "verify", *at)["content_sha256"]
+
+
+def test_simulate_writes_what_it_is_asked(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    made = ("simulate", str(tmp_path), "--format", "csv", "--duration", "12", "--no-vps", "--json")
+    logs = document(capsys, *made, "--lever-arm", "0.05,0.02,-0.03", "--dip-deg", "60", "--seed", "7")["logs"]
+    assert [Path(path).name for path in logs] == ["flight-01"]
+    assert not (Path(logs[0]) / "vps.csv").exists()
+    assert "lever_arm_m = [0.05, 0.02, -0.03]" in (tmp_path / "fieldcal.toml").read_text()
+    assert json.loads((Path(logs[0]).parent / "flight-01.truth.json").read_text())["seed"] == 7
+
+
+@pytest.mark.parametrize(
+    ("tokens", "word"),
+    [
+        (["nightly"], "ARCHIVE"),
+        (["nightyl", "x"], "nightly"),
+        (["nightly", "/no/such/folder"], "/no/such/folder"),
+        (["session", "/no/such/folder"], "/no/such/folder"),
+        (["calibrate", "/no/such/log.mcap"], "/no/such/log.mcap"),
+        (["history", "--since", "yesterday", "--warehouse", "."], "--since"),
+        (["simulate", "x", "--lever-arm", "1,2"], "--lever-arm"),
+        (["simulate", "x", "--lost-share", "1.5"], "--lost-share"),
+    ],
+)
+def test_mistakes_in_use_end_in_2(capsys: pytest.CaptureFixture[str], tokens: list[str], word: str) -> None:
+    assert word in sentence(capsys, *tokens, code=2)
+
+
+def test_mistakes_in_the_configuration_end_in_2(
+    capsys: pytest.CaptureFixture[str], log: Path, archive: Path, tmp_path: Path
+) -> None:
+    assert "smoothing_cutoff_hz" in sentence(capsys, "calibrate", str(log), "--set", "smoothing_cutof_hz=3", code=2)
+    assert "smoothing_cutoff_hz" in sentence(capsys, "calibrate", str(log), "--set", "smoothing_cutoff_hz=-1", code=2)
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text("[defaults]\ngravity_mps = 9.81\n")
+    told = sentence(capsys, "nightly", str(archive), "--config", str(wrong), "--warehouse", str(tmp_path / "w"), code=2)
+    assert "gravity_mps2" in told
+    assert not (tmp_path / "w").exists()
+
+
+def test_no_warehouse_is_a_failure(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for command in (["history"], ["sql", "SELECT 1"], ["verify"]):
+        assert "nightly" in sentence(capsys, *command, "--warehouse", str(tmp_path / "none"), code=1)
+
+
+def test_a_server_that_does_not_answer_is_named(
+    capsys: pytest.CaptureFixture[str], archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PREFECT_API_URL", "http://127.0.0.1:9/api")
+    monkeypatch.setattr("fieldcal.flows.server.ANSWER_TIMEOUT_S", 0.3)
+    told = sentence(capsys, "nightly", str(archive), "--warehouse", str(tmp_path / "w"), code=1)
+    assert "http://127.0.0.1:9/api" in told

@@ -1,0 +1,123 @@
+"""Tables: every column defined, with unit and meaning, and checked against what a file says."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pyarrow as pa
+import pytest
+
+from fieldcal import schemas
+from fieldcal.schemas import columns
+from fieldcal.schemas.column import Column
+
+
+def all_columns() -> list[Column]:
+    return [column for table in schemas.TABLES.values() for column in table.columns]
+
+
+def test_every_numeric_column_has_a_unit_and_every_column_a_meaning() -> None:
+    for column in all_columns():
+        assert column.meaning, column.name
+        assert bool(column.unit) == column.numeric, column.name
+
+
+def test_a_column_name_means_one_thing() -> None:
+    """Apart from the two pairs that say so: a name is one definition, wherever it stands."""
+    definitions: dict[str, set[Column]] = {}
+    for column in all_columns():
+        definitions.setdefault(column.name, set()).add(column)
+    assert {name for name, found in definitions.items() if len(found) > 1} == {
+        "value",
+        "magnetometer_x",
+        "magnetometer_y",
+        "magnetometer_z",
+    }
+
+
+def test_keys_are_columns_and_names_unique_within_a_table() -> None:
+    for table in schemas.TABLES.values():
+        assert set(table.key) <= set(table.column_names)
+        assert len(set(table.column_names)) == len(table.columns)
+
+
+def test_history_tables_lead_with_flight_vehicle_imu_session_and_start() -> None:
+    lead = tuple(column.name for column in columns.LEAD)
+    assert lead == ("flight_id", "vehicle_id", "imu_id", "session_id", "started_at")
+    for name in schemas.HISTORY_TABLES:
+        if name != "drift":
+            assert schemas.TABLES[name].column_names[:5] == lead
+
+
+def test_arrow_schema_carries_units_meanings_and_facts() -> None:
+    schema = schemas.arrow_schema(
+        "imu", units={"gyroscope": "deg/s", "accelerometer_y": "g"}, metadata={"fieldcal.flight_id": "ab"}
+    )
+    unit = {field.name: field.metadata[b"unit"].decode() for field in schema}
+    assert unit["gyroscope_x"] == "deg/s"
+    assert unit["accelerometer_x"] == schemas.AS_LOGGED
+    assert unit["accelerometer_y"] == "g"
+    assert unit["t_ns"] == "ns"
+    assert schema.metadata[b"fieldcal.table"] == b"imu"
+    assert schema.metadata[b"fieldcal.schema_version"] == b"1"
+    assert schema.metadata[b"fieldcal.flight_id"] == b"ab"
+    assert (
+        schemas.arrow_schema("segments", units={"gyroscope": "rad/s"}).field("rate_rms").metadata[b"unit"] == b"rad/s"
+    )
+
+
+def test_stage_level_tables_lack_lead_and_run_key() -> None:
+    assert schemas.stage_columns("calibration") == (
+        "sensor",
+        "method",
+        "parameter",
+        "axis",
+        "value",
+        "sd",
+        "unit",
+        "temperature_degc",
+        "status",
+        "reason_code",
+    )
+    assert schemas.table_key("calibration", stage=True) == ("sensor", "method", "parameter", "axis")
+    assert schemas.table_key("sync", stage=True) == ()
+    with pytest.raises(KeyError, match="no stage writes"):
+        schemas.stage_columns("run")
+
+
+def test_unknown_table_names_the_known_ones() -> None:
+    with pytest.raises(KeyError, match="calibration"):
+        schemas.arrow_schema("calibrations")
+
+
+def test_check_accepts_its_own_schema_in_any_column_order() -> None:
+    for name in schemas.TABLES:
+        schema = schemas.arrow_schema(name)
+        schemas.check(schema, name)
+        schemas.check(pa.schema(list(schema)[::-1]), name)
+    schemas.check(schemas.arrow_schema("fit", stage=True), "fit", stage=True)
+
+
+def test_check_names_every_difference() -> None:
+    imu = schemas.arrow_schema("imu")
+    with pytest.raises(schemas.SchemaMismatch, match="missing gyroscope_z"):
+        schemas.check(imu.remove(imu.get_field_index("gyroscope_z")), "imu")
+    with pytest.raises(schemas.SchemaMismatch, match="not in the table: surprise"):
+        schemas.check(imu.append(pa.field("surprise", pa.int8())), "imu")
+    with pytest.raises(schemas.SchemaMismatch, match="t_ns is double instead of int64"):
+        schemas.check(imu.set(0, pa.field("t_ns", pa.float64())), "imu")
+    with pytest.raises(schemas.SchemaMismatch, match="it says it is the table vps"):
+        schemas.check(imu.with_metadata({"fieldcal.table": "vps"}), "imu")
+    with pytest.raises(schemas.SchemaMismatch, match="schema version 99"):
+        schemas.check(imu.with_metadata({"fieldcal.schema_version": "99"}), "imu")
+    with pytest.raises(schemas.SchemaMismatch, match="twice"):
+        schemas.check(pa.schema([*imu, imu.field(1)]), "imu")
+
+
+def test_data_dictionary_lists_every_column() -> None:
+    text = subprocess.run([sys.executable, "-m", "fieldcal.schemas"], capture_output=True, text=True, check=True).stdout
+    for table in schemas.TABLES.values():
+        assert f"### {table.name} (version {table.version})" in text
+    for column in all_columns():
+        assert column.meaning in text

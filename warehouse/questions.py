@@ -1,0 +1,78 @@
+"""Questions to the history that have a command of their own."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import polars as pl
+
+from fieldcal.errors import FieldcalError
+from fieldcal.warehouse import Warehouse, WarehouseError
+
+COLUMNS = (
+    "started_at",
+    "vehicle_id",
+    "imu_id",
+    "session_id",
+    "flight_id",
+    "sensor",
+    "method",
+    "parameter",
+    "axis",
+    "value",
+    "sd",
+    "unit",
+    "temperature_degc",
+    "status",
+    "reason_code",
+)
+
+
+def calibration_history(
+    root: Path, vehicle: str | None, sensor: str | None, parameter: str | None, since: str | None
+) -> pl.DataFrame:
+    """Rows of `calibration`, oldest flight first, flights of unknown time at the end."""
+    rows = existing(root).scan("calibration", vehicle_id=vehicle)
+    for column, wanted in (("sensor", sensor), ("parameter", parameter)):
+        if wanted is not None:
+            rows = rows.filter(pl.col(column) == wanted)
+    if since is not None:
+        rows = rows.filter(pl.col("started_at") >= moment_of("--since", since))
+    order = ["started_at", "vehicle_id", "flight_id", "sensor", "method", "parameter", "axis"]
+    return rows.select(COLUMNS).sort(order, nulls_last=True).collect()
+
+
+def answer(root: Path, query: str) -> pl.DataFrame:
+    """One SELECT over the tables and views."""
+    return existing(root).sql(query)
+
+
+def existing(root: Path) -> Warehouse:
+    """The warehouse at `root`.
+
+    Raises
+    ------
+    WarehouseError
+        `no_warehouse`.
+    """
+    if not root.is_dir():
+        raise WarehouseError(
+            "no_warehouse", f"There is no warehouse at {root}; run `fieldcal nightly` or give --warehouse."
+        )
+    return Warehouse(root)
+
+
+def moment_of(option: str, text: str) -> datetime:
+    """The moment that an option of the command line names; UTC where it has no zone.
+
+    Raises
+    ------
+    FieldcalError
+        `wrong_option`.
+    """
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise FieldcalError("wrong_option", f'{option} needs a date such as 2026-05-04, not "{text}".') from error
+    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
