@@ -1,14 +1,13 @@
 """Batches in spawned processes of this machine, within the night's flow run.
 
-A module of its own, because Prefect may load `nightly` under another name, which other processes would not find.
-Each process tells Prefect's server of its tasks itself: through this one every event would be sent twice.
+A module of its own, because Prefect may load `nightly` under another name, which other processes would not find. Each
+process tells Prefect's server of its tasks itself: through this one every event would be sent twice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager, nullcontext
 from importlib import import_module
 from multiprocessing import get_context
 from typing import Any
@@ -17,26 +16,24 @@ from fieldcal.flows.runners import Answers, answer_of
 
 LISTEN_S = 0.25
 
-_begun: list[ProcessPoolExecutor] = []
+
+def spawned(workers: int) -> ProcessPoolExecutor:
+    """Processes that inherit nothing of this one."""
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
 
 
-@contextmanager
-def processes_begun(workers: int) -> Iterator[None]:
-    """Within the block processes start and import what a batch needs; `process_answers` takes them."""
-    with spawned(workers) as pool:
-        for _ in range(workers):
-            pool.submit(_import)
-        _begun.append(pool)
-        try:
-            yield
-        finally:
-            _begun.clear()
+def spawned_ahead(workers: int) -> ProcessPoolExecutor:
+    """The same, already importing what a batch needs."""
+    pool = spawned(workers)
+    for _ in range(workers):
+        pool.submit(_import)
+    return pool
 
 
-def process_answers(workers: int, inputs: Sequence[dict[str, Any]]) -> Answers:
+def process_answers(pool: ProcessPoolExecutor, inputs: Sequence[dict[str, Any]]) -> Answers:
     """Run the batches; call it within the flow run that their tasks belong to."""
     context = _context()
-    with nullcontext(_begun.pop()) if _begun else spawned(workers) as pool:
+    with pool:
         waiting: dict[Future[dict[str, Any]], dict[str, Any]] = {}
         waiting |= {pool.submit(_batch, context, given): given for given in inputs}
         while waiting:
@@ -44,11 +41,6 @@ def process_answers(workers: int, inputs: Sequence[dict[str, Any]]) -> Answers:
             for future in wait(waiting, LISTEN_S, FIRST_COMPLETED).done:
                 yield waiting.pop(future), answer_of(future)
         pool.shutdown(wait=False)  # they tell Prefect the rest while the night publishes
-
-
-def spawned(workers: int) -> ProcessPoolExecutor:
-    """Processes that inherit nothing of this one."""
-    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
 
 
 def _context() -> dict[str, Any]:
@@ -69,8 +61,9 @@ def _batch(context: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
     from prefect.context import hydrated_context
 
     from fieldcal.flows import nightly
+    from fieldcal.flows.tasks import run_batch
 
     run = context["flow_run_context"]
-    flow = {own.name: own for own in (nightly.nightly, nightly.session)}[run["flow"]]
+    flow = {known.name: known for known in (nightly.nightly, nightly.session)}[run["flow"]]
     with hydrated_context({**context, "flow_run_context": {**run, "flow": flow}}):
-        return nightly.run_batch(**given)
+        return run_batch(**given)

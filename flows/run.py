@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from fieldcal.flows.server import running_server
 from fieldcal.warehouse.layout import prepare
 
 if TYPE_CHECKING:
-    from fieldcal.flows.watching import Watcher
+    from fieldcal.batch.night import Watcher
 
 
 def run_night(
@@ -32,22 +33,29 @@ def run_night(
     began = time.monotonic()
     find_source(config, archive)
     prepare(root)
-    named = str(config) if config else None
     runner, scheduler = where.get("runner") or "process", where.get("scheduler")
     with running_server(root) as server:
         starting = time.monotonic()
+        from prefect.settings import PREFECT_API_URL, temporary_settings
+
+        from fieldcal.batch.night import plan_night
         from fieldcal.flows.housekeeping import tidy_prefect
-        from fieldcal.flows.nightly import prepared, run_nightly
-        from fieldcal.flows.runners import Parallel
+        from fieldcal.flows.nightly import flow_of
+        from fieldcal.flows.processes import spawned_ahead
+        from fieldcal.flows.runners import Parallel, batches
 
         imported = time.monotonic()
-        with prepared(archive, root, named, session, Parallel(workers, runner, scheduler)):
+        night = plan_night(archive, root, config, session)
+        parallel = Parallel(workers, runner, scheduler)
+        elsewhere = runner == "process" and not parallel.in_this_process(len(batches(night.missing(), workers)))
+        with spawned_ahead(workers) if elsewhere else nullcontext() as processes:
             waiting = time.monotonic()
             url = server.wait()
             start_s = imported - starting + time.monotonic() - waiting
             tidy_prefect(root, url, own_server=server.own)
-            what = {"archive": str(archive)} if session is None else {"folder": str(session)}
-            result = run_nightly(url, progress, **what, warehouse=str(root), config=named, workers=workers, **where)
+            with temporary_settings({PREFECT_API_URL: url}):
+                planned = flow_of(night, parallel, progress, processes)
+                result = planned(str(session or archive), str(root), workers, runner)
     logs = result.pop("logs")
     times = {"seconds": round(time.monotonic() - began, 3), "server_seconds": round(start_s, 3)}
     return {**result, **times, "logs": logs}

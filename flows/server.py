@@ -59,7 +59,6 @@ def prepare_environment(root: Path, *, serving: bool = False) -> None:
     """Settings that Prefect reads when it is imported; what the user has set stays. Its files go below `root`."""
     for name, value in QUIET.items():
         os.environ.setdefault(name, value)
-    os.environ["PYTHONSAFEPATH"] = "1"  # for processes started from here: what lies in the current folder is not ours
     home = home_of(root, serving=serving)
     os.environ.setdefault("PREFECT_HOME", str(home))
     if Path(os.environ["PREFECT_HOME"]) == home:

@@ -62,7 +62,9 @@ def run_sql(
         `sql_refused` (not one SELECT, or it reaches outside), `sql_wrong` (syntax, unknown names, wrong types),
         `sql_timeout`, `sql_too_large`.
     """
-    texts = {view: (files("warehouse") / "views" / f"{view}.sql").read_text(encoding="utf-8") for view in VIEWS}
+    texts = {
+        view: (files("fieldcal.warehouse") / "views" / f"{view}.sql").read_text(encoding="utf-8") for view in VIEWS
+    }
     with _sentences(timeout_s, memory_mb):
         try:
             return _answer(root, query, parameters, _named(query, texts), timeout_s, memory_mb, max_result_mb)

@@ -8,7 +8,7 @@ from typing import Any
 
 from fieldcal.batch.outcome import Outcome, failed_outcome
 from fieldcal.batch.source_ledger import know_sources
-from fieldcal.batch.steps import STEPS, FlightWork, Record
+from fieldcal.batch.steps import STEPS, FlightWork
 from fieldcal.config.configuration import Configuration
 from fieldcal.config.find import Source, configuration_of
 from fieldcal.errors import unforeseen
@@ -23,17 +23,11 @@ OTHER_CODE = [
     "night ran, or the workers have another version. Nothing is lost; run it again.",
 ]
 
-Step = Callable[[FlightWork, str], tuple[Record, bool]]
-"""Make sure that a step's result is there; its record, and whether it had to run."""
+Step = Callable[[FlightWork, str], object]
+"""Make sure that a step's result is there."""
 
 
-def one_step(work: FlightWork, step: str) -> tuple[Record, bool]:
-    """Take a step's result from the cache, or run it."""
-    record = work.find(step)
-    return (work.run(step), True) if record is None else (record, False)
-
-
-def one_flight(root: Path, job: Job, settings: Configuration, do: Step = one_step) -> Outcome:
+def one_flight(root: Path, job: Job, settings: Configuration, do: Step = FlightWork.do) -> Outcome:
     """All steps of one flight. Whatever goes wrong costs this flight alone.
 
     Raises
@@ -48,12 +42,12 @@ def one_flight(root: Path, job: Job, settings: Configuration, do: Step = one_ste
         if step not in work.steps():
             break
         try:
-            _, did_run = do(work, step)
+            do(work, step)
         except WarehouseError:
             raise
         except Exception as error:
             return failed_outcome(job, work.records, step, unforeseen(job.log_uri, error))
-        (ran if did_run else cached).append(step)
+        (ran if step in work.why else cached).append(step)
     return Outcome(job, work.records, tuple(ran), tuple(cached), work.why, work.work_s)
 
 
@@ -62,7 +56,7 @@ def flights(
     source: Source,
     jobs: list[dict[str, Any]],
     code: str,
-    do: Step = one_step,
+    do: Step = FlightWork.do,
     tell: Callable[[Outcome], None] | None = None,
 ) -> dict[str, Any]:
     """A batch of flights in this process: `outcomes`, plain JSON, and `error`: what concerns every log of the night.

@@ -92,6 +92,11 @@ class FlightWork:
         """run_key of a step; the records of the steps before it must be known."""
         return run_key(step, step_sources()[step], self._params(step), self._hashes(step))
 
+    def do(self, step: str) -> None:
+        """Take a step's result from the cache, or run it."""
+        if self.find(step) is None:
+            self.run(step)
+
     def find(self, step: str) -> Record | None:
         """The record of a step whose result is there and whole, taken as the step's; else None, and `why` says why."""
         record = self._store.complete(step, self.job.flight_id, self.key(step))

@@ -260,6 +260,8 @@ def doctor(
 
 def main(tokens: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
+    # Processes started from here must not take what lies in the current folder for a module.
+    os.environ.setdefault("PYTHONSAFEPATH", "1")
     sys.exit(run(sys.argv[1:] if tokens is None else tokens))
 
 
@@ -374,6 +376,3 @@ app.command(simulate)
 app.command(drift)
 app.command(export)
 app.command(apply)
-
-if __name__ == "__main__":
-    main()

@@ -55,7 +55,7 @@ def test_a_dask_cluster_gives_the_same(archive: Path, content: str, tmp_path: Pa
     assert (result["ok"], result["stages_run"]) == (6, 6 * len(STEPS))
     assert content_sha256(tmp_path) == content
     with cluster.get_client() as client:
-        worked = client.run(lambda: "fieldcal.flows.nightly" in sys.modules)
+        worked = client.run(lambda: "fieldcal.flows.tasks" in sys.modules)
     assert list(worked.values()) == [True, True]
 
 

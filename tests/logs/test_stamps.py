@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_flows_ingest import Reader, counts, imu, rows
+from test_tidy import Reader, counts, imu, rows
 
 from fieldcal.logs import Columns, stamps
 from fieldcal.logs.ingest import TidyLog

@@ -1,0 +1,109 @@
+"""A night before and after its batches: what it works on, whose outcomes go where, what it says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import polars as pl
+
+from fieldcal.batch.closing import Closing
+from fieldcal.batch.log_ledger import write_ledger
+from fieldcal.batch.outcome import Outcome, summary
+from fieldcal.batch.plan import Plan, make_plan
+from fieldcal.batch.publish_flights import publish_vehicle, withdraw
+from fieldcal.batch.source_ledger import know_sources
+from fieldcal.config.configuration import Configuration
+from fieldcal.config.find import Source, configuration_of, find_source
+from fieldcal.flight.job import Job
+from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.files import remove_abandoned
+from fieldcal.warehouse.layout import prepare
+
+
+class Watcher(Protocol):
+    """Hears of the night's progress."""
+
+    def planned(self, flights: int, missing: int) -> None: ...
+    def done(self, outcome: Outcome) -> None: ...
+
+
+@dataclass(frozen=True)
+class Night:
+    """A planned night. `session`: the one folder of the archive that it is about, or None for all."""
+
+    archive: Path
+    root: Path
+    session: Path | None
+    source: Source
+    configuration: Configuration
+    plan: Plan
+
+    def missing(self) -> list[Job]:
+        """Flights with steps to run."""
+        return [job for job in self.plan.jobs if job.flight_id in self.plan.missing]
+
+    def unchanged(self) -> Iterator[Outcome]:
+        """Outcomes of the flights all of whose results are there."""
+        for job in self.plan.jobs:
+            if job.flight_id in self.plan.unchanged:
+                records = self.plan.unchanged[job.flight_id]
+                yield Outcome(job, records, cached=tuple(records))
+
+    def document(self, outcomes: Sequence[Outcome], closing: Closing) -> dict[str, Any]:
+        """The JSON of the night, without how long it took."""
+        changes = [change.row() for change in closing.changes]
+        told = summary(outcomes, self.plan.copies, self.plan.copied, self.root)
+        return {**told, "changes": changes, "report": str(closing.report)}
+
+
+def plan_night(archive: Path, root: Path, config: Path | None = None, session: Path | None = None) -> Night:
+    """Look at the archive, or at one session folder of it, and at what the warehouse holds.
+
+    Raises
+    ------
+    ConfigurationError, WarehouseError
+        What concerns every log.
+    """
+    source = find_source(config, archive)
+    configuration = configuration_of(source)
+    prepare(root)
+    remove_abandoned(root)
+    know_sources(root, keep=True)
+    plan = make_plan(root, archive, configuration, session)
+    write_ledger(root, [*plan.jobs, *plan.copied])
+    return Night(archive, root, session, source, configuration, plan)
+
+
+@dataclass(frozen=True)
+class Publishing:
+    """What the publishing of a vehicle needs. `moved`: flights that another vehicle's history has, by vehicle."""
+
+    root: Path
+    vehicle_id: str
+    configuration: Configuration
+    outcomes: Sequence[Outcome]
+    moved: Mapping[str, set[str]]
+
+    def publish(self) -> list[str]:
+        """Bring the history of the vehicle up to the outcomes; the tables that changed."""
+        flights = [(outcome.job, outcome.records) for outcome in self.outcomes]
+        changed = publish_vehicle(self.root, self.vehicle_id, flights, self.configuration)
+        for former, flight_ids in self.moved.items():
+            withdraw(self.root, former, flight_ids)
+        return list(changed)
+
+
+def publishings(night: Night, outcomes: Sequence[Outcome]) -> Iterator[Publishing]:
+    """One a vehicle; flights that were published under another vehicle leave it."""
+    recorded = Warehouse(night.root).scan("flight").select("flight_id", "vehicle_id").collect()
+    for vehicle_id in sorted({outcome.job.vehicle_id for outcome in outcomes}):
+        flown = [outcome for outcome in outcomes if outcome.job.vehicle_id == vehicle_id]
+        ids = [outcome.job.flight_id for outcome in flown]
+        elsewhere = recorded.filter(pl.col("flight_id").is_in(ids) & (pl.col("vehicle_id") != vehicle_id))
+        moved: dict[str, set[str]] = {}
+        for flight_id, former in elsewhere.iter_rows():
+            moved.setdefault(former, set()).add(flight_id)
+        yield Publishing(night.root, vehicle_id, night.configuration, flown, moved)

@@ -1,0 +1,66 @@
+"""The night's work as Prefect tasks: a step of a flight, a batch of flights, the publishing of a vehicle.
+
+A step whose result is in the warehouse, whole, ends in the state `Cached` with its run_key as cache key: the warehouse
+is the only cache, so Prefect keeps no results of its own (a result record of Prefect's chooses its own deserialiser).
+Where Prefect's server is lost, the work goes on without it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar, cast
+
+from prefect import task
+from prefect.cache_policies import NO_CACHE
+from prefect.client.schemas.objects import State, StateDetails
+from prefect.states import Completed
+from prefect.utilities.annotations import quote
+
+from fieldcal.batch.flights import flights
+from fieldcal.batch.night import Publishing, Watcher
+from fieldcal.batch.steps import FlightWork
+from fieldcal.config.find import Source
+from fieldcal.warehouse.errors import WarehouseError
+
+T = TypeVar("T")
+
+
+def unseen(value: T) -> T:
+    """A parameter of a task that Prefect does not walk through; the task gets it as it is."""
+    return cast(T, quote(value))
+
+
+@task(name="step", task_run_name="{step} {log_uri}", cache_policy=NO_CACHE, persist_result=False)
+def run_step(work: FlightWork, step: str, log_uri: str) -> State[Any]:
+    """One step of a flight, from the cache or run; the state says which."""
+    work.do(step)
+    run_key = work.records[step]["run_key"]
+    reference = {"stage": step, "flight_id": work.job.flight_id, "run_key": run_key}
+    details = StateDetails(cache_key=run_key)
+    if step in work.why:
+        return Completed(message=f"Run: {work.why[step]}.", data=reference, state_details=details)
+    return Completed(name="Cached", message="The result is there and whole.", data=reference, state_details=details)
+
+
+@task(name="batch", task_run_name="batch {number}", cache_policy=NO_CACHE, persist_result=False)
+def run_batch(
+    number: int, root: str, source: Source, jobs: list[dict[str, Any]], code: str, watcher: Watcher | None = None
+) -> dict[str, Any]:
+    """A batch of flights, every step a task (`fieldcal.batch.flights.flights`)."""
+    return flights(root, source, jobs, code, do=step_as_task, tell=None if watcher is None else watcher.done)
+
+
+@task(name="publish", task_run_name="publish {vehicle_id}", cache_policy=NO_CACHE, persist_result=False)
+def run_publish(vehicle_id: str, work: Publishing) -> list[str]:
+    """Bring the history of one vehicle up to the night's outcomes; the tables that changed."""
+    return work.publish()
+
+
+def step_as_task(work: FlightWork, step: str) -> None:
+    """One step as a Prefect task; where Prefect itself fails, without it."""
+    try:
+        run_step(unseen(work), step, work.job.log_uri)
+    except WarehouseError:
+        raise
+    except Exception:
+        if step not in work.records:
+            work.do(step)
