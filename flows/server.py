@@ -92,7 +92,7 @@ class Server:
     def __init__(self, home: Path, *, serving: bool = False) -> None:
         self.own = not os.environ.get("PREFECT_API_URL")
         self._url = os.environ.get("PREFECT_API_URL", "")
-        self._home = home
+        self._home = home.resolve()
         self._serving = serving
         self._process: subprocess.Popen[bytes] | None = None
         self._using: int | None = None
@@ -165,6 +165,7 @@ class Server:
                     str(self._home / USERS),
                     *self._kind(),
                 ],
+                cwd=self._home,  # Prefect's migrations put the current folder on the path, whatever lies there
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -172,6 +173,7 @@ class Server:
                     **os.environ,
                     **{name: os.environ.get(name, value) for name, value in extra.items()},
                     "PREFECT_API_URL": self._url,
+                    "PREFECT_HOME": str(self._home),
                     "PYTHONPATH": _python_path(),
                 },
                 start_new_session=True,
