@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import write_flight
-from fieldcal.simulation.experiment import BIAS, MID_SCALE, SCALE, SENSORS, Experiment, simulate
+from fieldcal.simulation.experiment import BIAS, MID_SCALE, SCALE, Experiment, simulate
 from fieldcal.trends.drift_table import table_of, update_drift
 from fieldcal.warehouse import Warehouse
 

@@ -27,8 +27,9 @@ from fieldcal.estimation.joint import initialise
 from fieldcal.estimation.joint.fit import JointFit, fit_joint
 from fieldcal.estimation.joint.problem import Readings
 from fieldcal.geometry.rotation import angle_between
+from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import settings, signals
-from fieldcal.simulation.experiment import SENSORS, Experiment, Recording, constants_at, simulate
+from fieldcal.simulation.experiment import Experiment, Recording, constants_at, simulate
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import AXES, QUATERNION, constants, matrix

@@ -19,12 +19,15 @@ from typing import Any
 import numpy as np
 
 from fieldcal.config.configuration import load
+from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.estimation.gyroscope.output_error import propagate_stretches, start_stretches
 from fieldcal.geometry.rotation import angle_between, slerp
 from fieldcal.logs import ingest
+from fieldcal.names import Sensor
 from fieldcal.stages.attitude import sensor_attitude
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
+from fieldcal.stages.settings import Axes, taken_from
 from fieldcal.stages.tables import AXES, QUATERNION, matrix, seconds, triad
 from fieldcal.stages.vps import bridged
 
@@ -43,7 +46,7 @@ def main() -> None:
         path = given.archive / name
         vehicle = configuration.vehicle(path.parent.parent.name)
         signals, facts = ingest.read_flight(path, vehicle)
-        settings = ingest.settings_of(facts, vehicle) | {"method": "joint", "use_vps": given.use_vps}
+        settings = ingest.settings_of(facts, vehicle).changed(method="joint", use_vps=given.use_vps)
         results = run_flight(signals, settings)
         drift = [_raw_drift(results, settings), *(_drift(results, m) for m in ("output_error", "joint"))]
         drift.append(_reference_drift(results, settings, _entry(reference, name)))
@@ -59,25 +62,25 @@ def _drift(results: dict[str, StageResult], method: str) -> float | None:
     return float(rows["rms"][0]) if len(rows) else None
 
 
-def _raw_drift(results: dict[str, StageResult], settings: dict[str, Any]) -> float | None:
+def _raw_drift(results: dict[str, StageResult], settings: FlightSettings) -> float | None:
     """The logged unit alone; None for counts."""
-    nominal = settings["nominal_scale"]["gyroscope"]
+    nominal = settings.nominal_scale[Sensor.GYROSCOPE]
     if nominal is None:
         return None
-    sign = np.asarray(settings["polarity"]["gyroscope"], dtype=float)
+    sign = np.asarray(settings.polarity[Sensor.GYROSCOPE], dtype=float)
     return _integrated_drift(results, settings, np.asarray(nominal) * sign, np.zeros(3))
 
 
 def _reference_drift(
-    results: dict[str, StageResult], settings: dict[str, Any], entry: dict[str, Any] | None
+    results: dict[str, StageResult], settings: FlightSettings, entry: dict[str, Any] | None
 ) -> float | None:
-    if entry is None or settings["units"]["gyroscope"] == "counts":
+    if entry is None or settings.units[Sensor.GYROSCOPE] == "counts":
         return None
     return _integrated_drift(results, settings, np.asarray(entry["scale"]), np.asarray(entry["bias_rad_s"]))
 
 
 def _integrated_drift(
-    results: dict[str, StageResult], settings: dict[str, Any], scale: np.ndarray, bias: np.ndarray
+    results: dict[str, StageResult], settings: FlightSettings, scale: np.ndarray, bias: np.ndarray
 ) -> float | None:
     """Rms angle, degrees, between the optical attitude and the gyroscope integrated with these constants, each segment
     from its best start."""
@@ -91,17 +94,17 @@ def _integrated_drift(
     part = segment[np.clip(np.searchsorted(t, at), 0, len(t) - 1)][near]
     rate = matrix(samples, triad("gyroscope")) * scale + bias
     own = slerp(t, propagate_stretches(t, rate, segment), at)[near]
-    optical = sensor_attitude(matrix(vps, QUATERNION), settings)[near]
+    optical = sensor_attitude(matrix(vps, QUATERNION), taken_from(settings, Axes))[near]
     model = start_stretches(own, optical, part, np.ones(len(own)), fixed=False)
     return float(np.degrees(np.sqrt(np.mean(angle_between(optical, model) ** 2))))
 
 
-def _against(results: dict[str, StageResult], settings: dict[str, Any], reference: dict[str, Any], name: str) -> str:
+def _against(results: dict[str, StageResult], settings: FlightSettings, reference: dict[str, Any], name: str) -> str:
     entry = _entry(reference, name)
     rows = results["joint"].tables.get("calibration")
     if rows is None:
         return f"refused: {results['joint'].reason_code}"
-    if entry is None or settings["units"]["gyroscope"] == "counts":
+    if entry is None or settings.units[Sensor.GYROSCOPE] == "counts":
         return "no reference in this unit"
     out = []
     for parameter, true_key, sd_key in (("scale", "scale", "scale_sd"), ("bias", "bias_rad_s", "bias_sd_rad_s")):

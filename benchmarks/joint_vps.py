@@ -14,7 +14,8 @@ from collections import defaultdict
 import numpy as np
 from joint_accuracy import CASES, flights_of, measure
 
-from fieldcal.simulation.experiment import SENSORS, simulate
+from fieldcal.names import SENSORS
+from fieldcal.simulation.experiment import simulate
 
 SHOWN = (
     *(f"scale {sensor}" for sensor in SENSORS),

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.config.parameters import PROFILES
 from fieldcal.estimation import smoothing
 from fieldcal.estimation.gyroscope.equation_error import predicted_quaternion_rate
@@ -57,7 +58,7 @@ def tic_table(runs: Mapping[str, Results]) -> str:
     return "\n".join(lines)
 
 
-def draw(folder: Path, r: Recording, results: Results, s: dict[str, Any]) -> list[Path]:
+def draw(folder: Path, r: Recording, results: Results, s: FlightSettings) -> list[Path]:
     """Figures 5–10 of the paper, PNG files in `folder`."""
     import matplotlib
 
@@ -102,7 +103,7 @@ def draw(folder: Path, r: Recording, results: Results, s: dict[str, Any]) -> lis
     for i, (name, stage, radius, unit) in enumerate(
         (
             ("magnetometer", "magnetometer", 1.0, "norm"),
-            ("accelerometer", "accelerometer_pass2", s["gravity_mps2"], "m/s²"),
+            ("accelerometer", "accelerometer_pass2", s.gravity_mps2, "m/s²"),
         )
     ):
         own = constants(results[stage].tables["calibration"], name, refused_too=True)
@@ -126,7 +127,7 @@ def draw(folder: Path, r: Recording, results: Results, s: dict[str, Any]) -> lis
         (t[thin], q[thin], "QUEST, about 9 Hz"),
         ["ε₁", "ε₂", "ε₃", "δ"],
     )
-    q_dot = smoothing.differentiate_samples(t, q, window_s=s["differentiation_window_s"])
+    q_dot = smoothing.differentiate_samples(t, q, window_s=s.parameters.differentiation_window_s)
     model = predicted_quaternion_rate(q, rates["equation_error"])
     names = ["ε̇₁", "ε̇₂", "ε̇₃", "δ̇"]
     _four(save, "figure-08-equation-error", (t, q_dot, "data"), (t, model, "model"), names)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,8 @@ needs_examples = pytest.mark.skipif(not EXAMPLES, reason="FIELDCAL_EXAMPLE_LOGS 
 
 def vehicle(*, csv: CsvMap | None = None, mcap: McapMap | None = None, units: dict[str, str] | None = None) -> Vehicle:
     """A vehicle of which nothing is configured but what is given."""
-    return replace(load(None).vehicle("any"), csv=csv or CsvMap(), mcap=mcap or McapMap(), units=units or {})
+    given = {"csv": csv or CsvMap(), "mcap": mcap or McapMap(), "units": units or {}}
+    return load(None).vehicle("any").model_copy(update=given)
 
 
 class Flight:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -58,7 +58,7 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
             update_drift(root)
         table = Warehouse(root).scan("drift").collect()
         # With other limits than last time, what they make old is told whenever it passed them.
-        limits = asdict(alerts)
+        limits = alerts.model_dump()
         since = datetime.fromisoformat(before["at"]) if before.get("alerts") == limits else None
         told = changes(former, table, last_usable(root), now=now, since=since, alerts=alerts)
         made = history_digest(root, ["drift"])

@@ -16,6 +16,7 @@ import polars as pl
 
 from fieldcal.batch.reasons import NO_RESULT, why_it_runs
 from fieldcal.config.configuration import Vehicle
+from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.errors import UnreadableLog, unforeseen
 from fieldcal.flight.job import Job, file_stamp
 from fieldcal.flight.versions import versions
@@ -24,6 +25,7 @@ from fieldcal.logs.tidy import Disordered
 from fieldcal.stages.pipeline import INGEST, PIPELINE, Stage, run_stage
 from fieldcal.stages.results import StageResult, plain
 from fieldcal.stages.run_key import run_key, source_digest
+from fieldcal.stages.settings import as_json, taken_from
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.files import file_sha256
 from fieldcal.warehouse.layout import signal_path
@@ -76,7 +78,7 @@ class FlightWork:
         self._root = root
         self._store = StageStore(root)
         self._vehicle = vehicle
-        self._settings: dict[str, Any] = {}
+        self._settings: FlightSettings | None = None
         self._inputs: dict[str, str] = {}
         self._tables: dict[str, pl.DataFrame] = {}
 
@@ -141,14 +143,19 @@ class FlightWork:
         outputs = record["signals"] if step == INGEST else record["outputs"]
         self._inputs |= {f"{step}.{table}": output["sha256"] for table, output in outputs.items()}
         if step == INGEST:
-            self._settings = ingest.settings_of(record["facts"], self._vehicle) if self.usable() else {}
+            self._settings = ingest.settings_of(record["facts"], self._vehicle) if self.usable() else None
 
     def _params(self, step: str) -> dict[str, Any]:
         if step != INGEST:
-            return {name: self._settings[name] for name in STAGES[step].settings}
+            return as_json(taken_from(self._known(), STAGES[step].takes))
         settings = self._vehicle.settings()
         named = {"vehicle_id": self.job.vehicle_id, "name": Path(self.job.path).name}
         return {**{name: settings[name] for name in ("csv", "mcap", "units")}, **named}
+
+    def _known(self) -> FlightSettings:
+        """The flight's settings; there are some once its log was found usable, and no stage runs before."""
+        assert self._settings is not None
+        return self._settings
 
     def _hashes(self, step: str) -> dict[str, str]:
         if step == INGEST:
@@ -234,7 +241,7 @@ class FlightWork:
         key = self.key(stage.name)
         try:
             tables = {name: self._table(name) for name in set(stage.reads.values()) if name in self._inputs}
-            result = run_stage(stage, tables, self._settings)
+            result = run_stage(stage, tables, self._known())
         except WarehouseError:
             raise
         except Exception as error:

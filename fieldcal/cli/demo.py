@@ -13,8 +13,9 @@ from fieldcal.cli.present_night import print_night
 from fieldcal.cli.progress import NightProgress
 from fieldcal.cli.show import console, table
 from fieldcal.flows.run import run_night
+from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import write_flights
-from fieldcal.simulation.experiment import SENSORS, Experiment
+from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.numbers import number, with_sd
 from fieldcal.words.talk import say

@@ -137,7 +137,7 @@ def simulate(
 
 
 def _by_sensor(name: str, texts: list[str] | None) -> dict[str, tuple[float, float, float]]:
-    from fieldcal.simulation.experiment import SENSORS
+    from fieldcal.names import SENSORS
 
     result = {}
     for text in texts or []:

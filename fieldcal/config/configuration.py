@@ -8,122 +8,183 @@ for vehicles that no log mentions, so that a misprint shows before the night and
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
-from functools import partial
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar
 
-from fieldcal.config import toml_checks as check
-from fieldcal.config.parameters import PARAMETERS, PROFILES, Value
-from fieldcal.config.toml_checks import Place, Triple
+from pydantic import AfterValidator, Field, ValidationError
+
+from fieldcal.config.mistakes import configuration_error
+from fieldcal.config.parameters import PROFILES, Parameters
+from fieldcal.config.values import (
+    Character,
+    ImuColumns,
+    ImuFields,
+    Methods,
+    PerSensor,
+    Positive,
+    PositiveTriple,
+    Rotation,
+    Signs,
+    Table,
+    Text,
+    Triple,
+    Units,
+    VpsColumns,
+    shown,
+    wrong,
+)
 from fieldcal.errors import ConfigurationError
+from fieldcal.names import SENSORS, Approach, Body, FieldUnit, GravitySign, ProfileName, World
 
-SENSORS = ("magnetometer", "accelerometer", "gyroscope")
-METHODS = ("serial", "joint")
-UNITS = {
-    "magnetometer": ("counts", "T", "uT", "G", "norm"),
-    "accelerometer": ("counts", "m/s^2", "g"),
-    "gyroscope": ("counts", "rad/s", "deg/s"),
-}
+IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 FIELD_UNITS = ("norm", "T", "uT", "G")
-TIME_UNITS = ("s", "ms", "us", "ns", "iso8601")
-IDENTITY: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-Paths = str | tuple[str, ...]
+AnyTable = TypeVar("AnyTable", bound=Table)
 
 
-@dataclass(frozen=True)
-class Field:
+def _meaning(text: str, unit: str = "") -> Any:
+    """What a key means, for people and for editors."""
+    return Field(description=text, json_schema_extra={"unit": unit} if unit else None)
+
+
+class LocalField(Table):
     """Local magnetic field: given as north, east, down in `unit`, or a place for the World Magnetic Model."""
 
-    unit: str
-    north_east_down: Triple | None = None
-    latitude_deg: float | None = None
-    longitude_deg: float | None = None
-    altitude_m: float = 0.0
+    unit: FieldUnit = "uT"
+    north_east_down: Annotated[Triple | None, _meaning("the field itself, in `unit`")] = None
+    latitude_deg: Annotated[float | None, Field(ge=-90.0, le=90.0, json_schema_extra={"unit": "deg"})] = None
+    longitude_deg: Annotated[float | None, Field(ge=-180.0, le=360.0, json_schema_extra={"unit": "deg"})] = None
+    altitude_m: Annotated[float, Field(ge=-1e3, le=8.5e5, json_schema_extra={"unit": "m"})] = 0.0
+
+    @classmethod
+    def check_whole(cls, raw: Mapping[str, object]) -> None:
+        """Either the field itself with its unit, or a place."""
+        if "north_east_down" in raw:
+            if others := sorted(raw.keys() - {"north_east_down", "unit"}):
+                told = f"give either north_east_down or a place, not both (north_east_down and {others[0]})"
+                wrong("wrong_value", told)
+            if "unit" not in raw:
+                wrong("wrong_value", f"north_east_down needs its unit, one of {', '.join(FIELD_UNITS)}")
+            vector = raw["north_east_down"]
+            if isinstance(vector, list | tuple) and len(vector) == 3 and not any(vector):
+                wrong("wrong_value", "the field cannot be zero", "north_east_down")
+            return
+        for key in ("latitude_deg", "longitude_deg"):
+            if key not in raw:
+                wrong(
+                    "wrong_value", f"{key} is missing; give north_east_down and unit, or latitude_deg and longitude_deg"
+                )
 
 
-@dataclass(frozen=True)
-class CsvMap:
-    """Where a vehicle's CSV logs differ from the default columns. `imu` and `vps` hold configured names only.
+class CsvMap(Table):
+    """Where a vehicle's CSV logs differ from the default columns. `imu` and `vps` hold configured names only."""
 
-    Keys of `imu`: t, gyroscope, accelerometer, magnetometer (three names each), temperature, current, throttle;
-    of `vps`: t, quaternion_xyzw (four names), position (three). Both empty: the default names are meant.
-    """
-
-    time_unit: str | None = None
-    rate_hz: float | None = None
-    imu: dict[str, Paths] = field(default_factory=dict)
-    vps: dict[str, Paths] = field(default_factory=dict)
-    separator: str | None = None
-    decimal: str | None = None
+    time_unit: Annotated[Literal["s", "ms", "us", "ns", "iso8601"] | None, _meaning("unit of the time column")] = None
+    rate_hz: Annotated[Positive | None, _meaning("rate of the rows, where no column tells time", "Hz")] = None
+    imu: Annotated[ImuColumns, _meaning("names of the columns of the IMU; three for a sensor")] = {}
+    vps: Annotated[VpsColumns, _meaning("names of the columns of the visual positioning system")] = {}
+    separator: Annotated[Character | None, _meaning("what separates the cells")] = None
+    decimal: Annotated[Literal[".", ","] | None, _meaning("the decimal point")] = None
 
 
-@dataclass(frozen=True)
-class McapMap:
-    """Topics and fields of a vehicle's MCAP logs where message types alone do not decide; `time`: the stamp used."""
+class McapMap(Table):
+    """Topics and fields of a vehicle's MCAP logs where message types alone do not decide."""
 
-    imu: str | None = None
-    magnetometer: str | None = None
-    vps: str | None = None
-    temperature: str | None = None
-    power: str | None = None
-    position: str | None = None
-    imu_fields: dict[str, Paths] | None = None
-    time: str = "header"
+    imu: Text | None = None
+    magnetometer: Text | None = None
+    vps: Text | None = None
+    temperature: Text | None = None
+    power: Text | None = None
+    position: Text | None = None
+    imu_fields: Annotated[ImuFields | None, _meaning("fields of the IMU's message: one vector, or three numbers")] = (
+        None
+    )
+    time: Annotated[Literal["header", "log"], _meaning("the stamp used: the message's own, or the recorder's")] = (
+        "header"
+    )
 
 
-@dataclass(frozen=True)
-class Vehicle:
-    """All that is configured of one vehicle, defaults and profile worked in. None: the log decides.
+class VehicleTable(Table):
+    """What the file may say of a vehicle. None: the log decides."""
 
-    `method` is one name for all sensors, or sensor → name where they differ.
-    """
+    imu_id: Annotated[Text | None, _meaning("the IMU on board; else the vehicle's own name stands for it")] = None
+    method: Annotated[Methods, _meaning("how sensors are calibrated; one name for all, or one for each")] = {}
+    profile: Annotated[ProfileName, _meaning("presets of the stage parameters")] = "full"
+    world: Annotated[World | None, _meaning("axes of the world that the VPS's attitudes refer to")] = None
+    body: Annotated[Body | None, _meaning("axes of the body: nose-starboard-underside, or nose-port-up")] = None
+    gravity_sign: Annotated[GravitySign | None, _meaning("what the accelerometer reads at rest")] = None
+    gravity_mps2: Annotated[
+        float, Field(ge=9.7, le=9.9, description="local gravity", json_schema_extra={"unit": "m/s^2"})
+    ] = 9.80665
+    field: Annotated[LocalField | None, _meaning("local magnetic field")] = None
+    rotation_body_from_sensor: Annotated[Rotation, _meaning("turns sensor axes into body axes")] = IDENTITY
+    lever_arm_m: Annotated[Triple | None, _meaning("from the centre of mass to the IMU, body axes", "m")] = None
+    polarity: Annotated[PerSensor[Signs], _meaning("sign of each axis as wired")] = {}
+    units: Annotated[Units, _meaning("units of the logged readings")] = {}
+    nominal_scale: Annotated[PerSensor[PositiveTriple], _meaning("scale of the data sheet, one or three numbers")] = {}
+    reference_reading: Annotated[PerSensor[Triple], _meaning("reading at which zero_bias is told")] = {}
+    csv: CsvMap = CsvMap()
+    mcap: McapMap = McapMap()
+    parameters: Parameters = Parameters()
+
+
+class Vehicle(VehicleTable):
+    """All that is configured of one vehicle, defaults and profile worked in; method and polarity of every sensor."""
 
     vehicle_id: str
     imu_id: str
-    method: str | dict[str, str]
-    profile: str
-    world: str | None
-    body: str | None
-    gravity_sign: str | None
-    gravity_mps2: float
-    field: Field | None
-    rotation_body_from_sensor: tuple[Triple, Triple, Triple]
-    lever_arm_m: Triple | None
-    polarity: dict[str, tuple[int, int, int]]
-    units: dict[str, str]
-    nominal_scale: dict[str, Triple]
-    reference_reading: dict[str, Triple]
-    csv: CsvMap
-    mcap: McapMap
-    parameters: dict[str, Value]
 
     def settings(self) -> dict[str, Any]:
         """Plain JSON of everything that can change results; names of vehicle and IMU do not, nor does the profile's."""
-        plain = _plain(asdict(self))
-        return {key: plain[key] for key in sorted(plain) if key not in ("vehicle_id", "imu_id", "profile")}
+        return self.model_dump(mode="json", exclude={"vehicle_id", "imu_id", "profile"})
 
 
-@dataclass(frozen=True)
-class LogsMap:
+def _inside(glob: str) -> str:
+    if Path(glob).is_absolute() or ".." in Path(glob).parts:
+        wrong("wrong_value", f"{shown(glob)} leaves the archive; give a glob relative to it")
+    return glob
+
+
+class LogsMap(Table):
     """Logs that do not lie as `<vehicle>/<session>/<log>`: a glob relative to the archive and what it stands for.
 
     `vehicle` and `session` may be None: then the folders' names decide.
     """
 
-    glob: str
-    vehicle: str | None = None
-    session: str | None = None
+    glob: Annotated[Text, AfterValidator(_inside)]
+    vehicle: Text | None = None
+    session: Text | None = None
+
+    @classmethod
+    def check_whole(cls, raw: Mapping[str, object]) -> None:
+        """The glob is needed."""
+        if "glob" not in raw:
+            wrong("wrong_value", "glob is missing: the files this entry stands for")
 
 
-@dataclass(frozen=True)
-class Alerts:
+class Archive(Table):
+    """`[archive]`."""
+
+    logs: list[LogsMap] = []
+
+
+class Alerts(Table):
     """Days after which a sensor's latest calibration has expired, and a vehicle without a usable flight is idle."""
 
-    expires_days: float = 90.0
-    idle_days: float = 30.0
+    expires_days: Annotated[Positive, _meaning("age at which a calibration has expired", "d")] = 90.0
+    idle_days: Annotated[Positive, _meaning("time without a usable flight after which a vehicle is idle", "d")] = 30.0
+
+
+class Document(Table):
+    """The whole of `fieldcal.toml`."""
+
+    defaults: Annotated[VehicleTable, _meaning("what holds for every vehicle that does not say otherwise")] = (
+        VehicleTable()
+    )
+    vehicles: Annotated[dict[str, VehicleTable], _meaning("by the vehicle's folder")] = {}
+    archive: Archive = Archive()
+    alerts: Alerts = Alerts()
 
 
 @dataclass(frozen=True)
@@ -131,17 +192,33 @@ class Configuration:
     """The loaded file. `vehicle` answers for any id; one that is not configured gets the defaults."""
 
     path: Path | None
-    vehicles: dict[str, Vehicle]
-    logs: tuple[LogsMap, ...]
-    alerts: Alerts
-    _defaults: Vehicle
+    document: Document
+
+    @property
+    def vehicles(self) -> tuple[str, ...]:
+        """Vehicles that the file names."""
+        return tuple(self.document.vehicles)
+
+    @property
+    def logs(self) -> tuple[LogsMap, ...]:
+        """Logs that do not lie in folders of vehicle and session."""
+        return tuple(self.document.archive.logs)
+
+    @property
+    def alerts(self) -> Alerts:
+        """When the report warns."""
+        return self.document.alerts
 
     def vehicle(self, vehicle_id: str) -> Vehicle:
         """What is configured for `vehicle_id`."""
-        if vehicle_id in self.vehicles:
-            return self.vehicles[vehicle_id]
-        imu_id = self._defaults.imu_id or vehicle_id
-        return Vehicle(**{**_fields(self._defaults), "vehicle_id": vehicle_id, "imu_id": imu_id})
+        table = _laid_over(self.document.defaults, self.document.vehicles.get(vehicle_id, VehicleTable()))
+        given = {
+            "imu_id": table.imu_id or vehicle_id,
+            "method": dict.fromkeys(SENSORS, Approach.SERIAL) | table.method,
+            "polarity": dict.fromkeys(SENSORS, (1, 1, 1)) | table.polarity,
+            "parameters": _with_presets(table.parameters, table.profile),
+        }
+        return Vehicle(**{**dict(table), **given, "vehicle_id": vehicle_id})
 
 
 def load(path: Path | None) -> Configuration:
@@ -163,221 +240,32 @@ def load(path: Path | None) -> Configuration:
         raise ConfigurationError("config_syntax", f"{path}: is not UTF-8 text (byte {error.start}).") from error
 
 
-def parse(document: str, path: Path | None) -> Configuration:
+def parse(text: str, path: Path | None) -> Configuration:
     """The same from the text of a file; `path` serves messages only."""
-    root = Place(str(path) if path else "fieldcal.toml")
+    file = str(path) if path else "fieldcal.toml"
     try:
-        content = tomllib.loads(document)
+        return Configuration(path, Document.model_validate(tomllib.loads(text)))
     except tomllib.TOMLDecodeError as error:
-        raise ConfigurationError("config_syntax", f"{root}: is not TOML: {error}.") from error
-    check.table(content, root, ("defaults", "vehicles", "archive", "alerts"))
-    defaults = _raw(content.get("defaults", {}), root / "defaults")
-    vehicles = {}
-    for vehicle_id, raw in check.table(content.get("vehicles", {}), root / "vehicles").items():
-        place = root / "vehicles" / vehicle_id
-        vehicles[vehicle_id] = _vehicle(vehicle_id, _merged(defaults, _raw(raw, place)))
-    logs = _logs(content.get("archive", {}), root / "archive")
-    alerts = _alerts(content.get("alerts", {}), root / "alerts")
-    return Configuration(path, vehicles, logs, alerts, _vehicle("", defaults))
+        raise ConfigurationError("config_syntax", f"{file}: is not TOML: {error}.") from error
+    except ValidationError as error:
+        raise configuration_error(file, Document, error) from error
 
 
-def _alerts(value: Any, place: Place) -> Alerts:
-    raw = check.table(value, place, ("expires_days", "idle_days"))
-    return Alerts(**{key: check.positive(days, place / key) for key, days in raw.items()})
+def _laid_over(under: AnyTable, over: AnyTable) -> AnyTable:
+    """`over` laid on `under`, tables key by key; a local field whole."""
+    changes: dict[str, object] = {}
+    for key in over.model_fields_set:
+        below, above = getattr(under, key), getattr(over, key)
+        if isinstance(above, dict) and isinstance(below, dict):
+            changes[key] = {**below, **above}
+        elif isinstance(above, Table) and isinstance(below, Table) and not isinstance(above, LocalField):
+            changes[key] = _laid_over(below, above)
+        else:
+            changes[key] = above
+    return under.model_copy(update=changes)
 
 
-# --- one function a key: raw TOML value -> checked value
-
-
-def _per_sensor(one: Callable[[Any, Place], Any], value: Any, place: Place) -> dict[str, Any]:
-    return {sensor: one(item, place / sensor) for sensor, item in check.table(value, place, SENSORS).items()}
-
-
-def _method(value: Any, place: Place) -> dict[str, str]:
-    """One name for all sensors, or a table of them."""
-    if isinstance(value, dict):
-        return _per_sensor(partial(check.choice, allowed=METHODS), value, place)
-    return dict.fromkeys(SENSORS, check.choice(value, place, METHODS))
-
-
-def _one_method(named: Mapping[str, str]) -> str | dict[str, str]:
-    every = {sensor: named.get(sensor, METHODS[0]) for sensor in SENSORS}
-    return every[SENSORS[0]] if len(set(every.values())) == 1 else every
-
-
-def _units(value: Any, place: Place) -> dict[str, str]:
-    raw = check.table(value, place, SENSORS)
-    return {sensor: check.choice(unit, place / sensor, UNITS[sensor]) for sensor, unit in raw.items()}
-
-
-def _field(value: Any, place: Place) -> Field:
-    raw = check.table(value, place, ("north_east_down", "unit", "latitude_deg", "longitude_deg", "altitude_m"))
-    if "north_east_down" in raw:
-        if others := sorted(raw.keys() - {"north_east_down", "unit"}):
-            place.fail(
-                "wrong_value", f"give either north_east_down or a place, not both (north_east_down and {others[0]})"
-            )
-        if "unit" not in raw:
-            place.fail("wrong_value", f"north_east_down needs its unit, one of {', '.join(FIELD_UNITS)}")
-        vector = check.triple(raw["north_east_down"], place / "north_east_down")
-        if not any(vector):
-            (place / "north_east_down").fail("wrong_value", "the field cannot be zero")
-        return Field(check.choice(raw["unit"], place / "unit", FIELD_UNITS), vector)
-    for key in ("latitude_deg", "longitude_deg"):
-        if key not in raw:
-            place.fail(
-                "wrong_value", f"{key} is missing; give north_east_down and unit, or latitude_deg and longitude_deg"
-            )
-    return Field(
-        check.choice(raw.get("unit", "uT"), place / "unit", FIELD_UNITS),
-        None,
-        check.number(raw["latitude_deg"], place / "latitude_deg", -90.0, 90.0),
-        check.number(raw["longitude_deg"], place / "longitude_deg", -180.0, 360.0),
-        check.number(raw.get("altitude_m", 0.0), place / "altitude_m", -1e3, 8.5e5),
-    )
-
-
-def _csv_imu(value: Any, place: Place) -> dict[str, Paths]:
-    raw = check.table(value, place, ("t", *SENSORS, "temperature", "current", "throttle"))
-    return {k: check.texts(v, place / k, 3) if k in SENSORS else check.text(v, place / k) for k, v in raw.items()}
-
-
-def _csv_vps(value: Any, place: Place) -> dict[str, Paths]:
-    counts = {"quaternion_xyzw": 4, "position": 3}
-    raw = check.table(value, place, ("t", *counts))
-    return {
-        k: check.texts(v, place / k, counts[k]) if k in counts else check.text(v, place / k) for k, v in raw.items()
-    }
-
-
-def _imu_fields(value: Any, place: Place) -> dict[str, Paths]:
-    raw = check.table(value, place, (*SENSORS, "temperature"))
-    return {
-        key: check.texts(item, place / key, 3)
-        if isinstance(item, list) and key in SENSORS
-        else check.text(item, place / key)
-        for key, item in raw.items()
-    }
-
-
-def _parameters(value: Any, place: Place) -> dict[str, Value]:
-    return {key: _parameter(key, item, place / key) for key, item in check.table(value, place, PARAMETERS).items()}
-
-
-def _parameter(key: str, value: Any, place: Place) -> Value:
-    parameter = PARAMETERS[key]
-    if parameter.choices:
-        return check.choice(value, place, parameter.choices)
-    if isinstance(parameter.default, bool):
-        return check.flag(value, place)
-    result = check.number(value, place, *(parameter.bounds or ()))
-    if isinstance(parameter.default, int):
-        if result != int(result):
-            place.fail("wrong_type", f"a whole number is needed here, not {value}")
-        return int(result)
-    return result
-
-
-def _keys(checks: Mapping[str, Callable[[Any, Place], Any]], value: Any, place: Place) -> dict[str, Any]:
-    """A table whose keys are those of `checks`, each value checked; what comes out holds configured keys only."""
-    return {key: checks[key](item, place / key) for key, item in check.table(value, place, checks).items()}
-
-
-_CSV_KEYS: dict[str, Callable[[Any, Place], Any]] = {
-    "time_unit": partial(check.choice, allowed=TIME_UNITS),
-    "rate_hz": check.positive,
-    "imu": _csv_imu,
-    "vps": _csv_vps,
-    "separator": check.character,
-    "decimal": partial(check.choice, allowed=(".", ",")),
-}
-_MCAP_KEYS: dict[str, Callable[[Any, Place], Any]] = {
-    **dict.fromkeys(("imu", "magnetometer", "vps", "temperature", "power", "position"), check.text),
-    "imu_fields": _imu_fields,
-    "time": partial(check.choice, allowed=("header", "log")),
-}
-_VEHICLE_KEYS: dict[str, Callable[[Any, Place], Any]] = {
-    "imu_id": check.text,
-    "method": _method,
-    "profile": partial(check.choice, allowed=PROFILES),
-    "world": partial(check.choice, allowed=("ned", "enu")),
-    "body": partial(check.choice, allowed=("frd", "flu")),
-    "gravity_sign": partial(check.choice, allowed=("gravity", "specific_force")),
-    "gravity_mps2": partial(check.number, lowest=9.7, highest=9.9),
-    "field": _field,
-    "rotation_body_from_sensor": check.rotation,
-    "lever_arm_m": check.triple,
-    "polarity": partial(_per_sensor, check.signs),
-    "units": _units,
-    "nominal_scale": partial(_per_sensor, check.positive_triple),
-    "reference_reading": partial(_per_sensor, check.triple),
-    "csv": partial(_keys, _CSV_KEYS),
-    "mcap": partial(_keys, _MCAP_KEYS),
-    "parameters": _parameters,
-}
-
-
-def _raw(value: Any, place: Place) -> dict[str, Any]:
-    return _keys(_VEHICLE_KEYS, value, place)
-
-
-def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """`over` laid on `under`, tables key by key."""
-    result = dict(under)
-    for key, value in over.items():
-        below = result.get(key)
-        result[key] = _merged(below, value) if isinstance(value, dict) and isinstance(below, dict) else value
-    return result
-
-
-def _vehicle(vehicle_id: str, raw: Mapping[str, Any]) -> Vehicle:
-    profile = raw.get("profile", "full")
-    defaults = {name: parameter.default for name, parameter in PARAMETERS.items()}
-    return Vehicle(
-        vehicle_id=vehicle_id,
-        imu_id=raw.get("imu_id", vehicle_id),
-        method=_one_method(raw.get("method", {})),
-        profile=profile,
-        world=raw.get("world"),
-        body=raw.get("body"),
-        gravity_sign=raw.get("gravity_sign"),
-        gravity_mps2=raw.get("gravity_mps2", 9.80665),
-        field=raw.get("field"),
-        rotation_body_from_sensor=raw.get("rotation_body_from_sensor", IDENTITY),
-        lever_arm_m=raw.get("lever_arm_m"),
-        polarity=dict.fromkeys(SENSORS, (1, 1, 1)) | raw.get("polarity", {}),
-        units=raw.get("units", {}),
-        nominal_scale=raw.get("nominal_scale", {}),
-        reference_reading=raw.get("reference_reading", {}),
-        csv=CsvMap(**raw.get("csv", {})),
-        mcap=McapMap(**raw.get("mcap", {})),
-        parameters={**defaults, **PROFILES[profile], **raw.get("parameters", {})},
-    )
-
-
-def _logs(value: Any, place: Place) -> tuple[LogsMap, ...]:
-    entries = check.table(value, place, ("logs",)).get("logs", [])
-    if not isinstance(entries, list):
-        (place / "logs").fail("wrong_type", "a list of tables is needed here")
-    return tuple(LogsMap(**_log(entry, place / "logs" / str(number))) for number, entry in enumerate(entries))
-
-
-def _log(value: Any, place: Place) -> dict[str, str]:
-    raw = _keys(dict.fromkeys(("glob", "vehicle", "session"), check.text), value, place)
-    if "glob" not in raw:
-        place.fail("wrong_value", "glob is missing: the files this entry stands for")
-    if Path(raw["glob"]).is_absolute() or ".." in Path(raw["glob"]).parts:
-        (place / "glob").fail("wrong_value", f'"{raw["glob"]}" leaves the archive; give a glob relative to it')
-    return raw
-
-
-def _fields(vehicle: Vehicle) -> dict[str, Any]:
-    return {name: getattr(vehicle, name) for name in vehicle.__dataclass_fields__}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(value[key]) for key in sorted(value)}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value
+def _with_presets(parameters: Parameters, profile: ProfileName) -> Parameters:
+    """Parameters with a profile's presets where nothing is configured."""
+    presets = {key: value for key, value in PROFILES[profile].items() if key not in parameters.model_fields_set}
+    return parameters.model_copy(update=presets)

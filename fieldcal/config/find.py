@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 from fieldcal.config.configuration import Configuration, Vehicle, load, parse
@@ -53,11 +52,9 @@ def with_parameters(vehicle: Vehicle, profile: str | None, changes: Mapping[str,
     lines.append("[defaults.parameters]")
     lines += [f"{json.dumps(name)} = {_toml_value(text)}" for name, text in changes.items()]
     given = parse("\n".join(lines), Path("command line")).vehicle(vehicle.vehicle_id)
-    over = {name: given.parameters[name] for name in changes}
-    base = dict(vehicle.parameters)
-    if profile is not None:
-        base |= {name: value for name, value in given.parameters.items() if name not in changes}
-    return replace(vehicle, profile=profile or vehicle.profile, parameters={**base, **over})
+    over = {name: getattr(given.parameters, name) for name in changes}
+    parameters = vehicle.parameters.model_copy(update=over) if profile is None else given.parameters
+    return vehicle.model_copy(update={"profile": profile or vehicle.profile, "parameters": parameters})
 
 
 def _toml_value(text: str) -> str:

@@ -5,25 +5,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
 
 from fieldcal.config.find import CONFIG_NAME, configuration_of, find_source
+from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.errors import FieldcalError
-from fieldcal.exports.calibration import SENSORS, Constants, Triad
+from fieldcal.exports.calibration import Constants, Triad
 from fieldcal.exports.calibration_at import constants_of
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.earth_field import UNIT_IN_TESLA
 from fieldcal.geometry.rotation import FRD_FROM_FLU, Array
 from fieldcal.logs import ingest
 from fieldcal.logs.mcap.write import imu_channel, magnetic_field_channel, temperature_channel, write_mcap
+from fieldcal.names import INERTIAL_FIRST, Sensor
 from fieldcal.stages.tables import columns_of, matrix, triad
 from fieldcal.warehouse.errors import disk
 from fieldcal.warehouse.store import TableWriter
 
-TABLE_OF = {"gyroscope": "imu", "accelerometer": "imu", "magnetometer": "magnetometer"}
+TABLE_OF = {Sensor.GYROSCOPE: "imu", Sensor.ACCELEROMETER: "imu", Sensor.MAGNETOMETER: "magnetometer"}
 FLU_FROM_FRD = FRD_FROM_FLU.T
 SPECIFIC_FORCE = {"gravity": -1.0, "specific_force": 1.0}
 
@@ -32,9 +33,9 @@ SPECIFIC_FORCE = {"gravity": -1.0, "specific_force": 1.0}
 class Calibrated:
     """Readings z of a log, sensor → (stamps ns, (n, 3) in the sensor axes as logged), and what was known for them."""
 
-    readings: dict[str, tuple[np.ndarray, Array]]
+    readings: dict[Sensor, tuple[np.ndarray, Array]]
     temperature: pl.DataFrame | None
-    settings: dict[str, Any]
+    settings: FlightSettings
     constants: Constants
     warnings: tuple[str, ...]
 
@@ -64,7 +65,7 @@ def apply_constants(
     settings = ingest.settings_of(facts, vehicle)
     temperature = signals.get("temperature") if temperature_degc is None else None
     readings, warnings = {}, []
-    for name in SENSORS:
+    for name in INERTIAL_FIRST:
         table = signals.get(TABLE_OF[name])
         if table is None or table.is_empty() or table[f"{name}_x"].null_count() == table.height:
             continue
@@ -72,10 +73,10 @@ def apply_constants(
         if constant is None:
             warnings.append(f"{name}: no constants, so it is left out.")
             continue
-        if constant.logged_unit != settings["units"][name]:
+        if constant.logged_unit != settings.units[name]:
             raise FieldcalError(
                 "unit_mismatch",
-                f"{log.name}: the {name} is in {settings['units'][name]}, the constants are for {constant.logged_unit};"
+                f"{log.name}: the {name} is in {settings.units[name]}, the constants are for {constant.logged_unit};"
                 " give the vehicle whose log this is (--vehicle), or its units in fieldcal.toml.",
             )
         t_ns = table["t_ns"].to_numpy()
@@ -95,9 +96,9 @@ def write_parquet(c: Calibrated, folder: Path) -> list[Path]:
         "vehicle_id": c.constants.vehicle_id,
         "imu_id": c.constants.imu_id,
         "constants_as_of": c.constants.as_of,
-        "gravity_sign": c.settings["gravity_sign"],
+        "gravity_sign": c.settings.gravity_sign,
     }
-    units = {name: c.constants.triads[name].unit for name in c.readings}
+    units: dict[str, str] = {name: c.constants.triads[name].unit for name in c.readings}
     written = []
     for table in ("imu", "magnetometer"):
         own = [name for name in c.readings if TABLE_OF[name] == table]
@@ -105,7 +106,7 @@ def write_parquet(c: Calibrated, folder: Path) -> list[Path]:
             continue
         t_ns = c.readings[own[0]][0]
         columns = {"t_ns": t_ns}
-        for name in SENSORS:
+        for name in INERTIAL_FIRST:
             if TABLE_OF[name] == table:
                 values = c.readings[name][1] if name in own else np.full((len(t_ns), 3), np.nan)
                 columns |= columns_of(values, triad(name))
@@ -120,18 +121,18 @@ def write_parquet(c: Calibrated, folder: Path) -> list[Path]:
 def write_ros(c: Calibrated, path: Path) -> tuple[str, ...]:
     """One MCAP of `sensor_msgs/Imu` and `MagneticField` by REP-103 and 145: body axes forward, left, up; specific
     force; rad/s, m/s² and tesla. What it cannot say is returned."""
-    body = FLU_FROM_FRD @ sensor_model.frd_from_sensor(c.settings["rotation_body_from_sensor"], c.settings["body"])
+    body = FLU_FROM_FRD @ sensor_model.frd_from_sensor(c.settings.rotation_body_from_sensor, c.settings.body)
     channels, warnings = [], []
-    gyroscope, accelerometer = c.readings.get("gyroscope"), c.readings.get("accelerometer")
+    gyroscope, accelerometer = c.readings.get(Sensor.GYROSCOPE), c.readings.get(Sensor.ACCELEROMETER)
     either = gyroscope or accelerometer
     if either is not None:
         nothing = np.full((len(either[0]), 3), np.nan)
-        sign = SPECIFIC_FORCE[c.settings["gravity_sign"]]
+        sign = SPECIFIC_FORCE[c.settings.gravity_sign]
         rate = nothing if gyroscope is None else gyroscope[1] @ body.T
         force = nothing if accelerometer is None else sign * accelerometer[1] @ body.T
         channels.append(imu_channel(either[0], None, rate, force, topic="/imu/data", frame_id="base_link"))
-    if (magnetometer := c.readings.get("magnetometer")) is not None:
-        unit = c.constants.triads["magnetometer"].unit
+    if (magnetometer := c.readings.get(Sensor.MAGNETOMETER)) is not None:
+        unit = c.constants.triads[Sensor.MAGNETOMETER].unit
         factor, topic = UNIT_IN_TESLA.get(unit), "/imu/mag"
         if factor is None:
             factor, topic = 1.0, "/imu/mag_norm"

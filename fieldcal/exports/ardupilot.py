@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from fieldcal.exports.autopilot import in_autopilot_units, not_held, symmetric, thermal
 from fieldcal.exports.calibration import Constants, Export, cubic_about
+from fieldcal.names import Sensor
 
 MILLIGAUSS = 1e-3
 COEFFICIENT = 1e6
@@ -30,12 +31,15 @@ def ardupilot(constants: Constants) -> Export:
     triads, warnings = in_autopilot_units(constants, magnetic_unit=MILLIGAUSS)
     rows: list[tuple[str, float | int]] = []
     warm = []
-    for sensor, short, offset in (("accelerometer", "ACC", "INS_ACCOFFS"), ("gyroscope", "GYR", "INS_GYROFFS")):
+    for sensor, short, offset in (
+        (Sensor.ACCELEROMETER, "ACC", "INS_ACCOFFS"),
+        (Sensor.GYROSCOPE, "GYR", "INS_GYROFFS"),
+    ):
         if (triad := triads.get(sensor)) is None:
             continue
         for i, axis in enumerate(AXES):
             rows.append((f"{offset}_{axis}", float(triad.zero[i])))
-            if sensor == "accelerometer":
+            if sensor == Sensor.ACCELEROMETER:
                 rows.append((f"INS_ACCSCAL_{axis}", float(triad.scale[i, i])))
         if thermal(triad) and triad.flown_degc is not None:
             warm.append((short, triad, *triad.flown_degc))
@@ -58,7 +62,7 @@ def ardupilot(constants: Constants) -> Export:
                 for i, axis in enumerate(AXES):
                     for order, coefficient in enumerate(cubic, start=1):
                         rows.append((f"INS_TCAL1_{short}{order}_{axis}", COEFFICIENT * float(coefficient[i])))
-    if (triad := triads.get("magnetometer")) is not None:
+    if (triad := triads.get(Sensor.MAGNETOMETER)) is not None:
         matrix, asymmetric = symmetric(triad, "ArduPilot")
         warnings += asymmetric
         off = (matrix[0, 1], matrix[0, 2], matrix[1, 2])

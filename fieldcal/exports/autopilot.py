@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from fieldcal.exports.calibration import Constants, Triad
+from fieldcal.names import Sensor
 
 UNIT = {
     "gyroscope": {"rad/s": 1.0, "deg/s": float(np.pi / 180.0)},
@@ -23,7 +24,7 @@ SYMMETRY = 1e-9
 """A matrix is symmetric when its halves differ by less than this share of it."""
 
 
-def in_autopilot_units(constants: Constants, magnetic_unit: float) -> tuple[dict[str, Triad], list[str]]:
+def in_autopilot_units(constants: Constants, magnetic_unit: float) -> tuple[dict[Sensor, Triad], list[str]]:
     """Triads with zeros in rad/s, m/s² and gauss / `magnetic_unit`, scales without unit; and why one is left out."""
     triads, warnings = {}, []
     for sensor, triad in constants.triads.items():
@@ -36,7 +37,7 @@ def in_autopilot_units(constants: Constants, magnetic_unit: float) -> tuple[dict
             )
             continue
         logged, calibrated = known[triad.logged_unit], known[triad.unit]
-        if sensor == "magnetometer":
+        if sensor == Sensor.MAGNETOMETER:
             logged, calibrated = logged / magnetic_unit, calibrated / magnetic_unit
         own = replace(
             triad,
@@ -57,24 +58,24 @@ def in_autopilot_units(constants: Constants, magnetic_unit: float) -> tuple[dict
     return triads, warnings
 
 
-def not_held(triads: dict[str, Triad], target: str, thermal_magnetometer: bool = False) -> list[str]:
+def not_held(triads: dict[Sensor, Triad], target: str, thermal_magnetometer: bool = False) -> list[str]:
     """Sentences on what the targets' common model leaves out."""
     warnings = []
-    if (gyroscope := triads.get("gyroscope")) is not None:
+    if (gyroscope := triads.get(Sensor.GYROSCOPE)) is not None:
         off = np.abs(gyroscope.scale - np.eye(3)).max()
         warnings.append(
             f"gyroscope: {target} has no gyroscope scale. Only the zero is exported; rates stay wrong by up to"
             f" {100.0 * off:.3g} %."
         )
-    if (accelerometer := triads.get("accelerometer")) is not None and not accelerometer.diagonal:
+    if (accelerometer := triads.get(Sensor.ACCELEROMETER)) is not None and not accelerometer.diagonal:
         warnings.append(f"accelerometer: {target} has no cross-axis terms; only the diagonal is exported.")
     for sensor, triad in triads.items():
-        if np.any(triad.scale_per_degc != 0.0) and sensor != "gyroscope":
+        if np.any(triad.scale_per_degc != 0.0) and sensor != Sensor.GYROSCOPE:
             warnings.append(
                 f"{sensor}: {target} has no slope of the scale on temperature; it is that at"
                 f" {triad.temperature_degc:g} °C."
             )
-        if sensor == "magnetometer" and not thermal_magnetometer and np.any(triad.zero_per_degc != 0.0):
+        if sensor == Sensor.MAGNETOMETER and not thermal_magnetometer and np.any(triad.zero_per_degc != 0.0):
             warnings.append(
                 f"magnetometer: {target} does not correct it for temperature; offsets are those at"
                 f" {triad.temperature_degc:g} °C."

@@ -6,7 +6,8 @@ import json
 
 import numpy as np
 
-from fieldcal.exports.calibration import SENSORS, Constants, Export
+from fieldcal.exports.calibration import Constants, Export
+from fieldcal.names import INERTIAL_FIRST
 
 APPLY = """\
 /* out = S (raw - Z) at temperature_degc; d = T - T0: S = scale + scale_per_degc d, Z = zero + zero_per_degc d
@@ -45,7 +46,7 @@ def c_header(constants: Constants) -> Export:
         "} fieldcal_triad;",
         "",
     ]
-    for sensor in SENSORS:
+    for sensor in INERTIAL_FIRST:
         if (triad := constants.triads.get(sensor)) is None:
             continue
         parts += [

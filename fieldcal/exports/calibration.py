@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldcal.geometry.rotation import Array
-
-SENSORS = ("gyroscope", "accelerometer", "magnetometer")
+from fieldcal.names import Sensor
 
 
 def cubic_about(first: Array, second: Array, third: Array, by_degc: float) -> tuple[Array, Array, Array]:
@@ -70,7 +69,7 @@ class Constants:
 
     vehicle_id: str
     imu_id: str
-    triads: Mapping[str, Triad]
+    triads: Mapping[Sensor, Triad]
     as_of: str
     """ISO 8601 of the latest flight that they come from; empty when its clock is unknown."""
 

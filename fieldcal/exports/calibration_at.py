@@ -9,7 +9,8 @@ import numpy as np
 import polars as pl
 
 from fieldcal.errors import FieldcalError
-from fieldcal.exports.calibration import SENSORS, Constants, Triad, cubic_about
+from fieldcal.exports.calibration import Constants, Triad, cubic_about
+from fieldcal.names import INERTIAL_FIRST
 from fieldcal.stages.tables import AXES
 from fieldcal.warehouse.questions import existing
 
@@ -41,7 +42,7 @@ def constants_of(root: Path, vehicle_id: str, temperature_degc: float | None = N
         raise FieldcalError("no_calibration", f"No calibration of vehicle {vehicle_id!r} is known; there is: {there}.")
     last = rows.sort("started_at", "flight_id", nulls_last=False).row(-1, named=True)
     rows = rows.filter(pl.col("imu_id") == last["imu_id"])
-    triads = {s: triad for s in SENSORS if (triad := _triad(rows.filter(sensor=s), at)) is not None}
+    triads = {s: triad for s in INERTIAL_FIRST if (triad := _triad(rows.filter(sensor=s), at)) is not None}
     if not triads:
         raise FieldcalError(
             "no_calibration",

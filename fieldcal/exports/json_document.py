@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from fieldcal.exports.calibration import SENSORS, Constants, Export, Triad
+from fieldcal.exports.calibration import Constants, Export, Triad
+from fieldcal.names import INERTIAL_FIRST
 
 MODEL = (
     "calibrated = S (raw - Z), d = T - temperature_degc; S = scale + scale_per_degc d, Z = zero + zero_per_degc d"
@@ -22,7 +23,7 @@ def json_document(constants: Constants) -> Export:
         "vehicle_id": constants.vehicle_id,
         "imu_id": constants.imu_id,
         "as_of": constants.as_of or None,
-        "sensors": {s: _triad(constants.triads[s]) for s in SENSORS if s in constants.triads},
+        "sensors": {s: _triad(constants.triads[s]) for s in INERTIAL_FIRST if s in constants.triads},
     }
     return Export(json.dumps(document, ensure_ascii=False, indent=1, allow_nan=False) + "\n", ())
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from fieldcal.exports.autopilot import in_autopilot_units, not_held, symmetric, thermal
 from fieldcal.exports.calibration import Constants, Export
+from fieldcal.names import Sensor
 
 REAL32, INT32 = 9, 6
 AXES = "XYZ"
@@ -26,12 +27,12 @@ def px4(constants: Constants) -> Export:
     """QGroundControl's parameter file: vehicle, component, name, value, MAVLink type, separated by tabs."""
     triads, warnings = in_autopilot_units(constants, magnetic_unit=1.0)
     rows: list[tuple[str, float | int, int]] = []
-    for sensor, name, letter in (("accelerometer", "ACC", "A"), ("gyroscope", "GYRO", "G")):
+    for sensor, name, letter in ((Sensor.ACCELEROMETER, "ACC", "A"), (Sensor.GYROSCOPE, "GYRO", "G")):
         if (triad := triads.get(sensor)) is None:
             continue
         for i, axis in enumerate(AXES):
             rows.append((f"CAL_{name}0_{axis}OFF", triad.zero[i], REAL32))
-            if sensor == "accelerometer":
+            if sensor == Sensor.ACCELEROMETER:
                 rows.append((f"CAL_{name}0_{axis}SCALE", triad.scale[i, i], REAL32))
         if thermal(triad) and triad.flown_degc is not None:
             rows.append((f"TC_{letter}_ENABLE", 1, INT32))
@@ -48,7 +49,7 @@ def px4(constants: Constants) -> Export:
                 f"{sensor}: TC_{letter}0_ID must be the device id of this sensor, as CAL_{name}0_ID is, or PX4 ignores"
                 " the temperature terms."
             )
-    if (triad := triads.get("magnetometer")) is not None:
+    if (triad := triads.get(Sensor.MAGNETOMETER)) is not None:
         matrix, asymmetric = symmetric(triad, "PX4")
         warnings += asymmetric
         for i, axis in enumerate(AXES):

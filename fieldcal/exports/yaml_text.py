@@ -14,8 +14,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from fieldcal.exports.calibration import SENSORS, Constants, Export
+from fieldcal.exports.calibration import Constants, Export
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import INERTIAL_FIRST, Sensor
 
 
 def ros(constants: Constants) -> Export:
@@ -30,7 +31,7 @@ def ros(constants: Constants) -> Export:
         f"      imu_id: {json.dumps(constants.imu_id)}",
         f"      as_of: {json.dumps(constants.as_of)}",
     ]
-    for sensor in SENSORS:
+    for sensor in INERTIAL_FIRST:
         if (triad := constants.triads.get(sensor)) is None:
             continue
         lines += [
@@ -53,7 +54,7 @@ def ros(constants: Constants) -> Export:
 def kalibr(constants: Constants) -> Export:
     """The `imu0` block of a Kalibr IMU chain."""
     warnings = ["Kalibr needs noise densities and random walks, which fieldcal does not estimate: add the four lines."]
-    blocks = {"accelerometer": "accelerometers", "gyroscope": "gyroscopes"}
+    blocks = {Sensor.ACCELEROMETER: "accelerometers", Sensor.GYROSCOPE: "gyroscopes"}
     lines = [
         f"# {constants.heading}",
         "imu0:",
@@ -73,7 +74,7 @@ def kalibr(constants: Constants) -> Export:
             "    M:",
             *_rows(np.linalg.inv(triad.scale), "    "),
         ]
-        if sensor == "gyroscope":
+        if sensor == Sensor.GYROSCOPE:
             lines += ["    A:", *_rows(np.zeros((3, 3)), "    "), "    C_gyro_i:", *_rows(np.eye(3), "    ")]
         warnings.append(f"{sensor}: Kalibr estimates the bias itself; the zero is a comment only.")
         if np.any(triad.scale_per_degc != 0.0) or np.any(triad.zero_per_degc != 0.0):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +10,14 @@ import polars as pl
 
 from fieldcal.config.configuration import Configuration
 from fieldcal.config.find import CONFIG_NAME, configuration_of, find_source, with_parameters
+from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.errors import FieldcalError, unforeseen
 from fieldcal.flight.job import Job
 from fieldcal.flight.rows import flight_row, judged, lead, published_tables, rows_frame, run_rows
 from fieldcal.flight.threads import one_thread
 from fieldcal.flight.versions import versions
 from fieldcal.logs import flight_id, ingest, log_format, log_sha256
+from fieldcal.names import SENSORS, Approach
 from fieldcal.stages.pipeline import INGEST, PIPELINE, run_stage
 from fieldcal.stages.results import StageResult, plain
 from fieldcal.words.rows import rows_of, unfolded
@@ -23,11 +25,12 @@ from fieldcal.words.rows import rows_of, unfolded
 
 @dataclass(frozen=True)
 class CalibratedLog:
-    """One log's results: `document` as `calibrate_log` returns it, every `stage.table`, and the stages' settings."""
+    """One log's results: `document` as `calibrate_log` returns it, every `stage.table`, and the flight's settings, None
+    of a log that is not usable."""
 
     document: dict[str, Any]
     tables: dict[str, pl.DataFrame]
-    settings: dict[str, Any]
+    settings: FlightSettings | None
 
 
 def calibrate_log(log: Path, config: Path | None = None, **choices: Any) -> dict[str, Any]:
@@ -65,10 +68,10 @@ def run_log(
     job = _job(log, vehicle_id, session_id or log.parent.name, archive)
     vehicle = with_parameters(configuration.vehicle(vehicle_id), profile, changes or {})
     if method is not None:
-        vehicle = replace(vehicle, method=method)
+        vehicle = vehicle.model_copy(update={"method": dict.fromkeys(SENSORS, Approach(method))})
     signals, facts = ingest.read_flight(log, vehicle)
     records: dict[str, dict[str, Any]] = {INGEST: _record(_ingest_result(facts))}
-    settings: dict[str, Any] = {}
+    settings: FlightSettings | None = None
     tables: dict[str, pl.DataFrame] = {f"{INGEST}.{name}": frame for name, frame in signals.items()}
     if facts["verdict"] in ("ok", "partial"):
         settings = ingest.settings_of(facts, vehicle)

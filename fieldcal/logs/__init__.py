@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from fieldcal.config.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.csv.reader import CsvLog
 from fieldcal.logs.discovery import find_logs, flight_id, log_format, log_sha256
 from fieldcal.logs.interface import (
-    SENSORS,
     SIGNAL_COLUMNS,
     UNKNOWN_UNIT,
     Batch,
@@ -25,17 +25,16 @@ from fieldcal.logs.interface import (
     LogFile,
     LogReader,
     LogSummary,
-    VehicleLike,
 )
 from fieldcal.logs.mcap.reader import McapLog
 
-READERS: dict[str, Callable[[Path, VehicleLike], LogReader]] = {"mcap": McapLog, "csv": CsvLog}
+READERS: dict[str, Callable[[Path, Vehicle], LogReader]] = {"mcap": McapLog, "csv": CsvLog}
 """Log format (as `discovery.log_format` names it) -> reader."""
 
 _NOT_YET = {"ulog": "PX4 ULog", "dataflash": "ArduPilot DataFlash"}
 
 
-def open_log(path: Path, vehicle: VehicleLike) -> LogReader:
+def open_log(path: Path, vehicle: Vehicle) -> LogReader:
     """Open a log for streaming.
 
     Parameters
@@ -62,7 +61,7 @@ def open_log(path: Path, vehicle: VehicleLike) -> LogReader:
     return READERS[kind](path, vehicle)
 
 
-def read_log(path: Path, vehicle: VehicleLike) -> tuple[dict[str, pl.DataFrame], LogSummary]:
+def read_log(path: Path, vehicle: Vehicle) -> tuple[dict[str, pl.DataFrame], LogSummary]:
     """A whole log in memory: signal table -> frame sorted by time, and the summary. Raises as `open_log`."""
     reader = open_log(path, vehicle)
     frames: dict[str, list[pl.DataFrame]] = {}
@@ -87,7 +86,6 @@ def batch_frame(table: str, columns: Columns) -> pl.DataFrame:
 
 __all__ = [
     "READERS",
-    "SENSORS",
     "SIGNAL_COLUMNS",
     "UNKNOWN_UNIT",
     "Batch",
@@ -98,7 +96,6 @@ __all__ = [
     "LogReader",
     "LogSummary",
     "McapLog",
-    "VehicleLike",
     "batch_frame",
     "find_logs",
     "flight_id",

@@ -16,7 +16,7 @@ import numpy as np
 import polars as pl
 
 from fieldcal.config.configuration import Vehicle
-from fieldcal.config.flight_settings import flight_settings
+from fieldcal.config.flight_settings import FlightSettings, flight_settings
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs import Finding, LogReader, LogSummary, open_log
 from fieldcal.logs.discovery import folder_parts
@@ -213,7 +213,7 @@ def started_at(facts: Mapping[str, Any]) -> datetime | None:
     return None if stamp is None else EPOCH + timedelta(microseconds=stamp // 1000)
 
 
-def settings_of(facts: Mapping[str, Any], vehicle: Vehicle) -> dict[str, Any]:
+def settings_of(facts: Mapping[str, Any], vehicle: Vehicle) -> FlightSettings:
     """Settings of the stages for this flight (`config.flight_settings.flight_settings`)."""
     place = facts["position"]
     return flight_settings(

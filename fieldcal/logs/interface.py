@@ -10,10 +10,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldcal.config.values import UNITS
+from fieldcal.names import SENSORS, Sensor
+
 Columns = dict[str, NDArray[Any]]
 Batch = tuple[str, Columns]
 
-SENSORS = ("gyroscope", "accelerometer", "magnetometer")
 UNKNOWN_UNIT = "unknown"
 
 SIGNAL_COLUMNS: Mapping[str, tuple[str, ...]] = {
@@ -33,25 +35,8 @@ SIGNAL_COLUMNS: Mapping[str, tuple[str, ...]] = {
     "power": ("t_ns", "current_a", "throttle"),
 }
 
-KNOWN_UNITS: Mapping[str, tuple[str, ...]] = {
-    "gyroscope": ("counts", "rad/s", "deg/s"),
-    "accelerometer": ("counts", "m/s^2", "g"),
-    "magnetometer": ("counts", "T", "uT", "G", "norm"),
-}
-
 EPOCH_KNOWN_AFTER_NS = 1_000_000_000 * 1_000_000_000
 """Stamps beyond 2001-09-09 are taken for Unix time, smaller ones for a clock with an unknown zero."""
-
-
-class VehicleLike(Protocol):
-    """The part of a configured vehicle that reading a log needs (`fieldcal.config.configuration.Vehicle`)."""
-
-    @property
-    def units(self) -> Mapping[str, str]: ...
-    @property
-    def csv(self) -> Any: ...
-    @property
-    def mcap(self) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -129,19 +114,19 @@ def stamps_are_epoch(t_ns: NDArray[np.int64]) -> bool:
 
 
 def logged_units(
-    summary: LogSummary, declared: Mapping[str, str], configured: Mapping[str, str], log_name: str
+    summary: LogSummary, declared: Mapping[str, str], configured: Mapping[Sensor, str], log_name: str
 ) -> dict[str, str]:
     """Unit per sensor: the configured one, else the log's own, else "unknown". A contradiction is a finding."""
-    units = {}
+    units: dict[str, str] = {}
     for sensor in SENSORS:
         own, wanted = declared.get(sensor), configured.get(sensor)
-        if own and own not in KNOWN_UNITS[sensor]:
+        if own and own not in UNITS[sensor]:
             if not wanted:
                 summary.add(
                     "unit_not_supported",
                     1,
                     f"{log_name}: the log gives its {sensor} in {own!r}, which is none of "
-                    f"{', '.join(KNOWN_UNITS[sensor])}. Convert the log.",
+                    f"{', '.join(UNITS[sensor])}. Convert the log.",
                 )
             own = None
         if own and wanted and own != wanted:

@@ -209,8 +209,7 @@ def _figures(data: FlightData) -> list[Section]:
     parts.append(Text("The readings are not stored: Figure 5 is missing.") if raw is None else raw)
     samples, attitude = (data.tables.get(name) for name in ("smoothing.samples", "attitude_pass2.attitude"))
     quality: list[Part] = []
-    needed = ("field_ned", "gravity_mps2", "field_unit")
-    if samples is not None and not samples.is_empty() and all(name in data.settings for name in needed):
+    if samples is not None and not samples.is_empty() and data.settings is not None:
         balls = draw.spheres(samples, data.calibration, data.settings)
         parts += balls or [Text("Figure 6 is missing: neither the magnetometer nor the accelerometer has constants.")]
         if attitude is None or attitude.is_empty() or attitude.height != samples.height:
@@ -292,7 +291,7 @@ def _stages(data: FlightData) -> list[Part]:
         ]
         for row in data.run
     ]
-    settings = [[name, _plain(value)] for name, value in sorted(data.settings.items())]
+    settings = [[name, _plain(value)] for name, value in sorted(data.parameters.items())]
     versions = next((row["versions"] for row in data.run if row["versions"]), None) or {}
     parts: list[Part] = [
         Folded(

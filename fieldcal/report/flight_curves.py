@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -13,6 +12,7 @@ from fieldcal.estimation.gyroscope.equation_error import predicted_quaternion_ra
 from fieldcal.estimation.gyroscope.output_error import propagate_stretches, start_stretches
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, conjugate, continuous, multiply, to_rotation_vector
+from fieldcal.report.flight_data import FigureSettings
 from fieldcal.stages.attitude import sensor_attitude
 from fieldcal.stages.inputs import differentiate_by_segment
 from fieldcal.stages.tables import QUATERNION, constants, matrix, seconds, triad
@@ -53,7 +53,7 @@ def curves(
     attitude: pl.DataFrame,
     calibration: pl.DataFrame,
     vps: pl.DataFrame | None,
-    settings: Mapping[str, Any],
+    settings: FigureSettings,
 ) -> Curves:
     """What Figures 7–10 show: smoothed readings, the constants of each method, the VPS where there is one."""
     origin = int(samples["t_ns"][0])
@@ -61,18 +61,18 @@ def curves(
     segment = samples["segment"].to_numpy()
     q = continuous(matrix(attitude, QUATERNION))
     q_sensor = continuous(sensor_attitude(q, settings))
-    axes = sensor_model.frd_from_sensor(settings["rotation_body_from_sensor"], settings["body"])
+    axes = sensor_model.frd_from_sensor(settings.rotation_body_from_sensor, settings.body)
     logged = matrix(samples, triad("gyroscope", "smoothed_"))
     found = {m: constants(calibration, "gyroscope", m, refused_too=True) for m in GYRO_METHODS}
     rate = {m: sensor_model.calibrate(logged, *own) for m, own in found.items() if own is not None and finite(own)}
     q_dot = model = propagated = None
     if "equation_error" in rate:
-        q_dot = differentiate_by_segment(samples, q_sensor, settings["differentiation_window_s"])
+        q_dot = differentiate_by_segment(samples, q_sensor, settings.differentiation_window_s)
         model = predicted_quaternion_rate(q_sensor, rate["equation_error"])
     if "output_error" in rate:
         relative = propagate_stretches(t, rate["output_error"], segment)
         weight = attitude["weight"].to_numpy()
-        fixed = settings["initial_attitude"] == "fixed"
+        fixed = settings.initial_attitude == "fixed"
         propagated = _same_side(start_stretches(relative, q_sensor, segment, weight, fixed=fixed), q_sensor)
     t_vps = q_vps = vps_rate = near = error = None
     if vps is not None and not vps.is_empty():

@@ -12,9 +12,10 @@ import polars as pl
 from fieldcal.errors import FieldcalError
 from fieldcal.flight.calibrate import CalibratedLog
 from fieldcal.flight.rows import rows_frame
+from fieldcal.names import InitialAttitude
 from fieldcal.schemas import SIGNAL_TABLES, SchemaMismatch
 from fieldcal.stages.pipeline import PIPELINE
-from fieldcal.stages.results import plain
+from fieldcal.stages.settings import Axes, Differentiation, Gravity, LocalField, as_json, from_json, taken_from
 from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.stage_store import StageStore
@@ -24,9 +25,18 @@ STAGE_TABLES = ("manoeuvre.segments", "smoothing.samples", "attitude_pass2.attit
 Row = Mapping[str, Any]
 
 
+@dataclass(frozen=True, kw_only=True)
+class FigureSettings(Axes, LocalField, Gravity, Differentiation):
+    """What the figures take of the stages' settings; `gate_norm` None: the second pass of the accelerometer is gone."""
+
+    initial_attitude: InitialAttitude
+    gate_norm: float | None = None
+
+
 @dataclass(frozen=True)
 class FlightData:
-    """One flight. `tables` are named `stage.table` as in the pipeline, `settings` are the stages' parameters.
+    """One flight. `tables` are named `stage.table` as in the pipeline, `parameters` are the stages' settings as plain
+    JSON, `settings` what the figures need of them, None where they do not say.
 
     `gone` names stages whose tables should be there and are not.
     """
@@ -37,7 +47,8 @@ class FlightData:
     sync: Row | None
     run: list[dict[str, Any]]
     tables: Mapping[str, pl.DataFrame]
-    settings: Mapping[str, Any]
+    parameters: Mapping[str, Any]
+    settings: FigureSettings | None
     gone: tuple[str, ...] = field(default=())
 
     @property
@@ -68,7 +79,7 @@ def read_flight(root: Path, flight_id: str) -> FlightData:
         signal = _signal(warehouse, name, ids)
         if not signal.is_empty():
             tables[f"ingest.{name}"] = signal.drop("vehicle_id", "flight_id")
-    stages, settings, gone = _stages(root, flight["flight_id"], run)
+    stages, parameters, gone = _stages(root, flight["flight_id"], run)
     sync = rows_of(history["sync"])
     return FlightData(
         flight,
@@ -77,7 +88,8 @@ def read_flight(root: Path, flight_id: str) -> FlightData:
         sync[0] if sync else None,
         run,
         tables | stages,
-        settings,
+        parameters,
+        from_json(parameters, FigureSettings),
         gone,
     )
 
@@ -85,6 +97,10 @@ def read_flight(root: Path, flight_id: str) -> FlightData:
 def of_log(log: CalibratedLog) -> FlightData:
     """A flight calibrated in memory, without a warehouse."""
     document = log.document
+    parameters: dict[str, Any] = {}
+    if log.settings is not None:
+        for stage in PIPELINE:
+            parameters |= as_json(taken_from(log.settings, stage.takes))
     return FlightData(
         document["flight"],
         rows_frame("calibration", document["calibration"]),
@@ -92,7 +108,8 @@ def of_log(log: CalibratedLog) -> FlightData:
         document["sync"],
         document["run"],
         log.tables,
-        plain(log.settings),
+        parameters,
+        from_json(parameters, FigureSettings),
     )
 
 
@@ -128,14 +145,14 @@ def _stages(
     """Tables that are there, the parameters of their stages, and the stages that should be there and are not."""
     store = StageStore(root)
     tables: dict[str, pl.DataFrame] = {}
-    settings: dict[str, Any] = {}
+    parameters: dict[str, Any] = {}
     gone = []
     for row in run:
         stage = row["stage"]
         if stage == "ingest" or row["status"] == "failed":
             continue
         record = store.record(stage, flight_id, str(row["run_key"]))
-        settings |= (record or {}).get("params") or {}
+        parameters |= (record or {}).get("params") or {}
         wanted = [name for name in STAGE_TABLES if name.split(".")[0] == stage]
         if record is None:
             gone.append(stage)
@@ -148,4 +165,4 @@ def _stages(
                 tables[name] = store.load(stage, flight_id, row["run_key"], [table])[table]
             except (WarehouseError, SchemaMismatch):
                 gone.append(stage)
-    return tables, settings, tuple(gone)
+    return tables, parameters, tuple(gone)

@@ -10,6 +10,7 @@ import polars as pl
 
 from fieldcal.geometry.rotation import Array, continuous, euler_angles
 from fieldcal.report.flight_curves import Curves, covered_cells, lengths
+from fieldcal.report.flight_data import FigureSettings
 from fieldcal.report.page import Plot
 from fieldcal.report.plot import INK, XYZ, backdrop, curve, headed, legend, panels, solid_panels, svg, without_wraps
 from fieldcal.report.words import plain_name, unit
@@ -85,11 +86,11 @@ def _origin(tables: Mapping[str, pl.DataFrame]) -> int:
     return 0
 
 
-def spheres(samples: pl.DataFrame, calibration: pl.DataFrame, settings: Mapping[str, Any]) -> list[Plot]:
+def spheres(samples: pl.DataFrame, calibration: pl.DataFrame, settings: FigureSettings) -> list[Plot]:
     """Figure 6: calibrated readings on their spheres; and how much of each sphere they cover."""
     radii = {
-        "magnetometer": (float(np.linalg.norm(settings["field_ned"])), unit(settings["field_unit"])),
-        "accelerometer": (float(settings["gravity_mps2"]), "m/s²"),
+        "magnetometer": (float(np.linalg.norm(settings.field_ned)), unit(settings.field_unit)),
+        "accelerometer": (settings.gravity_mps2, "m/s²"),
     }
     found = {name: vectors for name in radii if (vectors := lengths(samples, calibration, name)) is not None}
     if not found:

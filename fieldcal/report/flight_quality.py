@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 import polars as pl
 
 from fieldcal.geometry.rotation import Array
 from fieldcal.report.flight_curves import Curves, amplitude_spectrum, lengths
+from fieldcal.report.flight_data import FigureSettings
 from fieldcal.report.page import Plot
 from fieldcal.report.plot import INK, curve, headed, legend, panels, svg
 from fieldcal.report.words import plain_name
 from fieldcal.stages.tables import seconds
 
 
-def spectra(c: Curves, samples: pl.DataFrame, calibration: pl.DataFrame, settings: Mapping[str, Any]) -> Plot | None:
+def spectra(c: Curves, samples: pl.DataFrame, calibration: pl.DataFrame, settings: FigureSettings) -> Plot | None:
     """Amplitude spectra of the residuals of every step, log-log."""
     wanted: list[tuple[str, str, list[tuple[str, tuple[Array, Array] | None]]]] = []
     radii = {
-        "magnetometer": float(np.linalg.norm(settings["field_ned"])),
-        "accelerometer": float(settings["gravity_mps2"]),
+        "magnetometer": float(np.linalg.norm(settings.field_ned)),
+        "accelerometer": settings.gravity_mps2,
     }
     vectors = []
     for name, radius in radii.items():
@@ -83,7 +81,7 @@ def _by_octave_shares(f: Array, x: Array, shares: int = 24) -> tuple[Array, Arra
     return np.exp(np.add.reduceat(np.log(f), start) / size), np.sqrt(power)
 
 
-def trust(attitude: pl.DataFrame, segments: pl.DataFrame | None, settings: Mapping[str, Any]) -> Plot:
+def trust(attitude: pl.DataFrame, segments: pl.DataFrame | None, settings: FigureSettings) -> Plot:
     """Which samples the attitude trusts: excess lengths of both vectors, weight, and the excited segments."""
     origin = int(attitude["t_ns"][0])
     t = seconds(attitude["t_ns"], origin)
@@ -97,10 +95,10 @@ def trust(attitude: pl.DataFrame, segments: pl.DataFrame | None, settings: Mappi
     ):
         curve(axes[row, 0], t, attitude[column].to_numpy(), INK["c1"], width=0.8)
         headed(axes[row, 0], title)
-    gate = settings.get("gate_norm")
+    gate = settings.gate_norm
     if gate is not None:
         for side in (-1, 1):
-            axes[0, 0].axhline(side * gate * settings["gravity_mps2"], color=INK["warn"], linewidth=0.8, linestyle="--")
+            axes[0, 0].axhline(side * gate * settings.gravity_mps2, color=INK["warn"], linewidth=0.8, linestyle="--")
     axes[2, 0].set_ylim(-0.05, 1.1)
     if segments is not None:
         for start, end, used in segments.select("start_ns", "end_ns", "used").iter_rows():

@@ -7,6 +7,7 @@ from typing import Any
 
 import polars as pl
 
+from fieldcal.names import INERTIAL_FIRST
 from fieldcal.report.plot import sparkline
 from fieldcal.report.trend import STATUSES
 from fieldcal.report.words import PARAMETERS, count, preferred, scientific, unit, with_unit
@@ -14,7 +15,6 @@ from fieldcal.warehouse import Warehouse
 
 POINTS = 60
 PLACE = ("sensor", "method", "parameter", "axis")
-SENSORS = ("gyroscope", "accelerometer", "magnetometer")
 LEVELS = ("zero_bias", "bias", "scale")
 Place = tuple[str, str, str, str]
 
@@ -70,7 +70,7 @@ def _steadiness(row: Mapping[str, Any]) -> tuple[Any, ...]:
 def _gyroscope(there: set[Any]) -> Place:
     """Level of the gyroscope's first axis by its most exact method; of another sensor where there is none."""
     sensors = {place[0] for place in there}
-    sensor = next(name for name in (*SENSORS, *sorted(sensors)) if name in sensors)
+    sensor = next(name for name in (*INERTIAL_FIRST, *sorted(sensors)) if name in sensors)
     method = preferred({place[1] for place in there if place[0] == sensor})
     parameters = {place[2] for place in there if place[:2] == (sensor, method)}
     parameter = next(name for name in (*LEVELS, *sorted(parameters)) if name in parameters)

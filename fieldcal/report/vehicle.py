@@ -10,12 +10,13 @@ from typing import Any
 import polars as pl
 
 from fieldcal.errors import FieldcalError
+from fieldcal.names import SENSORS
 from fieldcal.report.history import as_of_sentence, newest, reason_of, unfold, usable_flights
 from fieldcal.report.links import Links, flight_name
 from fieldcal.report.page import Column, Folded, Heading, Notice, Page, Part, Section, Simple, Table, Text, badge
 from fieldcal.report.trend import STATUSES, change_sentence, fly_with_sentence, worst_status
 from fieldcal.report.vehicle_figures import MOST_POINTS, agreement_plot, lag_plot, parameter_plot
-from fieldcal.report.words import PARAMETERS, SENSORS, age, count, day, plain_name, preferred, scientific, unit
+from fieldcal.report.words import PARAMETERS, age, count, day, plain_name, preferred, scientific, unit
 from fieldcal.stages.warm_up import METHOD as WARM_UP
 from fieldcal.stages.warm_up import PARAMETER as WARM_UP_SLOPE
 from fieldcal.warehouse import Warehouse

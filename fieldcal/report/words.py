@@ -7,7 +7,6 @@ from datetime import UTC, datetime
 from fieldcal.words.numbers import number, with_sd
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-SENSORS = ("magnetometer", "accelerometer", "gyroscope")
 PARAMETERS = ("scale", "zero_bias", "bias", "zero")
 METHODS = ("joint", "output_error", "ellipsoid_robust", "ellipsoid", "equation_error")
 """Estimators, the most exact first, as in the view `latest_calibration`."""

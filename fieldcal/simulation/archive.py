@@ -13,9 +13,10 @@ import numpy as np
 import polars as pl
 
 from fieldcal.config.configuration import parse
-from fieldcal.config.flight_settings import flight_settings
+from fieldcal.config.flight_settings import FlightSettings, flight_settings
 from fieldcal.logs.mcap.write import pose_channel, raw_imu_channel, write_mcap
-from fieldcal.simulation.experiment import SENSORS, Experiment, Recording, constants_at, simulate
+from fieldcal.names import SENSORS, Sensor
+from fieldcal.simulation.experiment import Experiment, Recording, constants_at, simulate
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, triad
 
 FIRST_FLIGHT = datetime(2026, 1, 12, 8, 0, tzinfo=UTC)
@@ -127,10 +128,12 @@ def write_flight(folder: Path, name: str, r: Recording, start: datetime, *, log_
 def signals(r: Recording) -> dict[str, pl.DataFrame]:
     """The recording as signal tables, as if its log had been read; stamps from 0."""
     t_ns = np.rint(r.t * 1e9).astype(np.int64)
-    imu = np.hstack([r.counts["gyroscope"], r.counts["accelerometer"]])
+    imu = np.hstack([r.counts[Sensor.GYROSCOPE], r.counts[Sensor.ACCELEROMETER]])
     out = {
         "imu": pl.DataFrame({"t_ns": t_ns, **columns_of(imu, triad("gyroscope") + triad("accelerometer"))}),
-        "magnetometer": pl.DataFrame({"t_ns": t_ns, **columns_of(r.counts["magnetometer"], triad("magnetometer"))}),
+        "magnetometer": pl.DataFrame(
+            {"t_ns": t_ns, **columns_of(r.counts[Sensor.MAGNETOMETER], triad("magnetometer"))}
+        ),
         "temperature": pl.DataFrame({"t_ns": t_ns, "temperature_degc": r.temperature}),
     }
     if len(r.vps_t):
@@ -140,10 +143,10 @@ def signals(r: Recording) -> dict[str, pl.DataFrame]:
     return out
 
 
-def settings(e: Experiment, vehicle_id: str = "sim-1", **changes: Any) -> dict[str, Any]:
+def settings(e: Experiment, vehicle_id: str = "sim-1", **changes: object) -> FlightSettings:
     """Flight settings of a simulated vehicle, as its fieldcal.toml gives them; `changes` replace parameters."""
     vehicle = parse(_vehicle_table(vehicle_id, e), None).vehicle(vehicle_id)
-    return flight_settings(vehicle, units=dict.fromkeys(SENSORS, "counts")) | changes
+    return flight_settings(vehicle, units=dict.fromkeys(SENSORS, "counts")).changed(**changes)
 
 
 def _write_mcap(path: Path, r: Recording, t_ns: np.ndarray, vps_ns: np.ndarray, start_ns: int) -> None:
@@ -153,9 +156,9 @@ def _write_mcap(path: Path, r: Recording, t_ns: np.ndarray, vps_ns: np.ndarray, 
         raw_imu_channel(
             t_ns,
             t_ns + LATENCY_NS["imu"],
-            counts["gyroscope"],
-            counts["accelerometer"],
-            counts["magnetometer"],
+            counts[Sensor.GYROSCOPE],
+            counts[Sensor.ACCELEROMETER],
+            counts[Sensor.MAGNETOMETER],
             r.temperature,
         )
     ]
@@ -171,7 +174,7 @@ def _write_mcap(path: Path, r: Recording, t_ns: np.ndarray, vps_ns: np.ndarray, 
 def _write_csv(folder: Path, r: Recording) -> None:
     """imu.csv and vps.csv under the default column names, time in seconds from the start, every digit that counts."""
     kind = pl.UInt16 if r.experiment.quantisation else pl.Float64
-    names = {"gyroscope": "g", "accelerometer": "a", "magnetometer": "m"}
+    names = {Sensor.GYROSCOPE: "g", Sensor.ACCELEROMETER: "a", Sensor.MAGNETOMETER: "m"}
     imu = {f"{short}{axis}": r.counts[name][:, i] for name, short in names.items() for i, axis in enumerate(AXES)}
     frame = pl.DataFrame({k: pl.Series(v).cast(kind) for k, v in imu.items()})
     frame.insert_column(0, _seconds("t_s", r.t))

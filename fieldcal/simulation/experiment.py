@@ -12,11 +12,11 @@ import numpy as np
 from numpy.random import Generator
 
 from fieldcal.geometry.rotation import Array, body_from_inertial, from_euler, from_rotation_vector, multiply, normalise
+from fieldcal.names import SENSORS, Sensor
 
 TICK_S = 25.6e-6
 BAND_LIMIT_HZ = 50.0
 DAMPING = np.sqrt(0.5)
-SENSORS = ("magnetometer", "accelerometer", "gyroscope")
 # Table 1: variances (norm², (m/s²)², (rad/s)², rad²)
 NOISE_VARIANCE = {"magnetometer": 34.043e-6, "accelerometer": 2.4594e-3, "gyroscope": 0.0183}
 VPS_VARIANCE = 0.8781e-9
@@ -91,7 +91,7 @@ class Recording:
 
     experiment: Experiment
     t: Array
-    counts: dict[str, Array]
+    counts: dict[Sensor, Array]
     temperature: Array
     vps_t: Array
     vps_q: Array

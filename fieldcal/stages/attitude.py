@@ -11,12 +11,11 @@ from fieldcal.estimation import wahba
 from fieldcal.estimation.faults import Fault
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, from_matrix, multiply
-from fieldcal.stages.inputs import Settings, Tables, spread_of
+from fieldcal.names import VECTOR_SENSORS, Sensor
+from fieldcal.stages.inputs import Tables, spread_of
 from fieldcal.stages.results import StageResult, fault_rows
+from fieldcal.stages.settings import AttitudeSettings, Axes, BodyVectors, LoggedValues, VectorConstants
 from fieldcal.stages.tables import QUATERNION, columns_of, constants, matrix, triad
-
-VECTOR_SENSORS = ("magnetometer", "accelerometer")
-
 
 # Trust in an attitude halves where the sensed length is off by this share of the field.
 TRUST_ACCELERATION, TRUST_FIELD = 0.01, 0.01
@@ -31,15 +30,15 @@ MAX_DIP_SCATTER_DEG = 4.0
 TRUSTED_SHARE = 0.2
 
 
-def logged_constants(s: Settings, name: str) -> tuple[Array, Array] | None:
+def logged_constants(s: LoggedValues, name: Sensor) -> tuple[Array, Array] | None:
     """Scale from the logged unit alone, bias 0: what an SI log says of itself. None for counts."""
-    nominal = s["nominal_scale"][name]
+    nominal = s.nominal_scale[name]
     if nominal is None:
         return None
-    return np.diag(np.asarray(nominal) * np.asarray(s["polarity"][name], dtype=float)), np.zeros(3)
+    return np.diag(np.array(nominal) * np.array(s.polarity[name], dtype=np.float64)), np.zeros(3)
 
 
-def vector_constants(tables: Tables, s: Settings, name: str) -> tuple[tuple[Array, Array] | None, bool]:
+def vector_constants(tables: Tables, s: VectorConstants, name: Sensor) -> tuple[tuple[Array, Array] | None, bool]:
     """Constants to make a vector of a triad's readings, and whether they are its own fit's.
 
     Else what the logged unit says; a magnetometer in a physical unit where the local field is only "norm" is scaled
@@ -47,34 +46,38 @@ def vector_constants(tables: Tables, s: Settings, name: str) -> tuple[tuple[Arra
     own = constants(tables[name], name) if name in tables else None
     if own is not None:
         return own, True
-    if s["nominal_scale"][name] is None and s["units"][name] != "counts":
+    if s.nominal_scale[name] is None and s.units[name] != "counts":
         length = float(np.nanmedian(np.linalg.norm(matrix(tables["samples"], triad(name, "smoothed_")), axis=1)))
-        scale = np.linalg.norm(s["field_ned"]) / length * np.asarray(s["polarity"][name], dtype=float)
+        scale = float(np.linalg.norm(s.field_ned)) / length * np.array(s.polarity[name], dtype=np.float64)
         return (np.diag(scale), np.zeros(3)), False
     return logged_constants(s, name), False
 
 
-def known_vectors(tables: Tables, s: Settings) -> dict[str, tuple[Array, Array]]:
+def known_vectors(tables: Tables, s: VectorConstants) -> dict[Sensor, tuple[Array, Array]]:
     """Constants of both vector triads, as the attitude stage used them; call only where it gave an attitude."""
     found = {name: vector_constants(tables, s, name)[0] for name in VECTOR_SENSORS}
     return {name: known for name, known in found.items() if known is not None}
 
 
-def body_vectors(samples: pl.DataFrame, used: Mapping[str, tuple[Array, Array]], s: Settings, *, prefix: str) -> Array:
+def body_vectors(
+    samples: pl.DataFrame, used: Mapping[Sensor, tuple[Array, Array]], s: BodyVectors, *, prefix: str
+) -> Array:
     """Calibrated magnetic field and gravity-signed acceleration in body axes, (n, 2, 3)."""
-    axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
-    field = sensor_model.calibrate(matrix(samples, triad("magnetometer", prefix)), *used["magnetometer"]) @ axes.T
-    gravity = sensor_model.calibrate(matrix(samples, triad("accelerometer", prefix)), *used["accelerometer"]) @ axes.T
-    return np.stack([field, sensor_model.GRAVITY_SIGNS[s["gravity_sign"]] * gravity], axis=1)
+    axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
+    field = sensor_model.calibrate(matrix(samples, triad("magnetometer", prefix)), *used[Sensor.MAGNETOMETER]) @ axes.T
+    gravity = (
+        sensor_model.calibrate(matrix(samples, triad("accelerometer", prefix)), *used[Sensor.ACCELEROMETER]) @ axes.T
+    )
+    return np.stack([field, sensor_model.GRAVITY_SIGNS[s.gravity_sign] * gravity], axis=1)
 
 
-def estimate_attitude(tables: Tables, s: Settings) -> StageResult:
+def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
     """samples and both triads' constants → attitude (Eq. 9), weighted by what the sensed lengths say.
 
     Where an SI log's ellipsoid is refused its logged values are used, flagged; raw counts stop here."""
-    used: dict[str, tuple[Array, Array]] = {}
+    used: dict[Sensor, tuple[Array, Array]] = {}
     fallback = []
-    for name in ("magnetometer", "accelerometer"):
+    for name in VECTOR_SENSORS:
         if tables["samples"][f"{name}_x"].null_count() == len(tables["samples"]):
             return StageResult(status="refused", reason_code=f"no_{name}", reason=f"Attitude needs a {name}.")
         own, fitted = vector_constants(tables, s, name)
@@ -88,24 +91,25 @@ def estimate_attitude(tables: Tables, s: Settings) -> StageResult:
             )
         used[name] = own
     vectors = body_vectors(tables["samples"], used, s, prefix="smoothed_")
-    strength, gravity = float(np.linalg.norm(s["field_ned"])), s["gravity_mps2"]
+    strength, gravity = float(np.linalg.norm(s.field_ned)), s.gravity_mps2
     field_excess = np.linalg.norm(vectors[:, 0], axis=1) / strength - 1.0
     acceleration_excess = np.linalg.norm(vectors[:, 1], axis=1) / gravity - 1.0
     sigma = np.array([spread_of(field_excess), spread_of(acceleration_excess)])
-    reference = np.array([s["field_ned"], [0.0, 0.0, 1.0]])
-    declination = float(np.arctan2(s["field_ned"][1], s["field_ned"][0]))
-    fit = wahba.attitudes(vectors, reference, sigma, method=s["attitude"], declination=declination)
+    reference = np.array([s.field_ned, [0.0, 0.0, 1.0]])
+    declination = float(np.arctan2(s.field_ned[1], s.field_ned[0]))
+    fit = wahba.attitudes(vectors, reference, sigma, method=s.attitude, declination=declination)
     weight = 1.0 / (1.0 + (acceleration_excess / TRUST_ACCELERATION) ** 2 + (field_excess / TRUST_FIELD) ** 2)
     dip = _dip_deg(vectors)[weight >= np.quantile(weight, 1.0 - TRUSTED_SHARE)]
     scatter = float(np.percentile(np.abs(dip - np.median(dip)), 90))
     expected_dip = float(np.degrees(np.arcsin(np.clip(reference[0, 2] / strength, -1, 1))))
-    measured = {
+    dip_deg = float(np.median(dip))
+    measured: dict[str, object] = {
         "logged_values_used": fallback,
         "direction_sd_rad": {"magnetometer": float(sigma[0]), "accelerometer": float(sigma[1])},
-        "dip_deg": float(np.median(dip)),
+        "dip_deg": dip_deg,
         "dip_expected_deg": expected_dip,
         "dip_scatter_deg": scatter,
-        "field": s["field_source"],
+        "field": s.field_source,
         "taste_median": float(np.median(fit.taste)),
     }
     if scatter > MAX_DIP_SCATTER_DEG:
@@ -117,13 +121,13 @@ def estimate_attitude(tables: Tables, s: Settings) -> StageResult:
             " number: a wrong polarity, swapped axes, or a magnet on board.",
             measured,
         )
-    if abs(expected_dip) > 20.0 and abs(measured["dip_deg"] + expected_dip) < 15.0:
+    if abs(expected_dip) > 20.0 and abs(dip_deg + expected_dip) < 15.0:
         return _contradiction(
             "gravity_sign_contradiction",
-            measured["dip_deg"],
+            dip_deg,
             expected_dip,
-            f"The sensed field dips by {measured['dip_deg']:.0f}° where {expected_dip:.0f}° is configured:"
-            f' gravity_sign "{s["gravity_sign"]}" (or the polarity of a whole triad) is the wrong way round.',
+            f"The sensed field dips by {dip_deg:.0f}° where {expected_dip:.0f}° is configured:"
+            f' gravity_sign "{s.gravity_sign}" (or the polarity of a whole triad) is the wrong way round.',
             measured,
         )
     table = pl.DataFrame(
@@ -155,7 +159,7 @@ def _dip_deg(vectors: Array) -> Array:
     return np.asarray(np.degrees(np.arcsin(np.clip(np.einsum("ni,ni->n", unit[:, 0], unit[:, 1]), -1.0, 1.0))))
 
 
-def sensor_attitude(q: Array, s: Settings) -> Array:
+def sensor_attitude(q: Array, s: Axes) -> Array:
     """Attitude of the sensor's own axes (n, 4) from that of the body: gyroscope constants live in sensor axes."""
-    axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
     return multiply(q, from_matrix(axes.T))

@@ -16,8 +16,9 @@ from fieldcal.estimation.theil import Fit, theil, theil_attitude
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, continuous, slerp
 from fieldcal.stages.attitude import body_vectors, known_vectors, sensor_attitude
-from fieldcal.stages.inputs import Settings, Tables, differentiate_by_segment, spread_of
+from fieldcal.stages.inputs import Tables, differentiate_by_segment, spread_of
 from fieldcal.stages.results import StageResult
+from fieldcal.stages.settings import Axes, SmoothingSettings, VerifySettings
 from fieldcal.stages.tables import QUATERNION, constants, matrix, seconds, triad
 from fieldcal.stages.vps import BRIDGE_S, RATE_COLUMNS, bridged, interpolate_attitude
 
@@ -39,7 +40,7 @@ FIT_SCHEMA = {
 }
 
 
-def verify_fit(tables: Tables, s: Settings) -> StageResult:
+def verify_fit(tables: Tables, s: VerifySettings) -> StageResult:
     """Everything estimated → fit: the paper's five TICs and one more, raw and smoothed, with physical units."""
     samples, attitude = tables["samples"], tables.get("attitude")
     t = seconds(samples["t_ns"], int(samples["t_ns"][0]))
@@ -54,13 +55,13 @@ def verify_fit(tables: Tables, s: Settings) -> StageResult:
     }
     vps = tables.get("vps_aligned")
     vps_t = None if vps is None else seconds(vps["t_ns"], int(samples["t_ns"][0]))
-    axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
     rows: list[dict[str, Any]] = []
 
     def add(quantity: str, method: str, reference: str, signal: str, fit: Fit, unit: str, sample: str = "all") -> None:
         rows.append(_fit_row(quantity, method, reference, signal, sample, fit, unit))
 
-    name = s["attitude"]
+    name = s.attitude
     for signal, q in sides.items():
         q = continuous(q)
         rate_logged = matrix(samples, triad("gyroscope", "" if signal == "raw" else "smoothed_"))
@@ -75,7 +76,7 @@ def verify_fit(tables: Tables, s: Settings) -> StageResult:
                 continue
             rate = sensor_model.calibrate(rate_logged, *own_constants)
             if method == "equation_error":
-                q_dot = differentiate_by_segment(samples, q_sensor, s["differentiation_window_s"])
+                q_dot = differentiate_by_segment(samples, q_sensor, s.differentiation_window_s)
                 add(
                     "quaternion_rate",
                     method,
@@ -87,7 +88,7 @@ def verify_fit(tables: Tables, s: Settings) -> StageResult:
             else:
                 relative = propagate_stretches(t, rate, segment)
                 weight = np.ones(len(t)) if attitude is None else attitude["weight"].to_numpy()
-                model = start_stretches(relative, q_sensor, segment, weight, fixed=s["initial_attitude"] == "fixed")
+                model = start_stretches(relative, q_sensor, segment, weight, fixed=s.initial_attitude == "fixed")
                 add("attitude_propagated", method, name, signal, theil_attitude(q_sensor, model), "deg")
                 if vps is not None and vps_t is not None:
                     _propagated_against_vps(add, method, signal, t, relative, segment, vps, vps_t, s)
@@ -124,14 +125,14 @@ def _fit_row(
     )
 
 
-def _raw_attitude(tables: Tables, s: Settings) -> Array:
+def _raw_attitude(tables: Tables, s: VerifySettings) -> Array:
     """Attitude from unsmoothed readings with the same constants and weights as the attitude stage."""
     vectors = body_vectors(tables["samples"], known_vectors(tables, s), s, prefix="")
-    lengths = np.linalg.norm(vectors, axis=2) / np.array([np.linalg.norm(s["field_ned"]), s["gravity_mps2"]])
+    lengths = np.linalg.norm(vectors, axis=2) / np.array([np.linalg.norm(s.field_ned), s.gravity_mps2])
     sigma = np.array([spread_of(lengths[:, 0]), spread_of(lengths[:, 1])])
-    reference = np.array([s["field_ned"], [0.0, 0.0, 1.0]])
-    declination = float(np.arctan2(s["field_ned"][1], s["field_ned"][0]))
-    return wahba.attitudes(vectors, reference, sigma, method=s["attitude"], declination=declination).q
+    reference = np.array([s.field_ned, [0.0, 0.0, 1.0]])
+    declination = float(np.arctan2(s.field_ned[1], s.field_ned[0]))
+    return wahba.attitudes(vectors, reference, sigma, method=s.attitude, declination=declination).q
 
 
 def _held_out(
@@ -141,7 +142,7 @@ def _held_out(
     segment: np.ndarray,
     vps: pl.DataFrame | None,
     vps_t: Array | None,
-    s: Settings,
+    s: Axes,
 ) -> None:
     """Constants of the first part of the flight predict the rest: attitude over stretches, and body rates, against the
     VPS, else against the joint attitude of the whole flight."""
@@ -170,7 +171,7 @@ def _held_out(
     fit = theil_attitude(continuous(to_sensor), model)
     add("attitude_propagated", "joint", name, "raw", fit, "deg", "held_out")
     if rates is not None:
-        axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+        axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
         body = np.column_stack([np.interp(reference_t[near], t, c) for c in (rate @ axes.T).T])
         add("body_rate", "joint", name, "raw", theil(rates[near], body), "rad/s", "held_out")
 
@@ -183,7 +184,7 @@ def _rates_against_vps(
     rate: Array,
     vps: pl.DataFrame,
     vps_t: Array,
-    s: Settings,
+    s: SmoothingSettings,
 ) -> None:
     """Body rates (n, 3), rad/s, against those of the VPS."""
     near = bridged(t, vps_t)
@@ -205,7 +206,7 @@ def _propagated_against_vps(
     segment: np.ndarray,
     vps: pl.DataFrame,
     vps_t: Array,
-    s: Settings,
+    s: Axes,
 ) -> None:
     """Open-loop drift: the gyroscope integrated over each segment from its best start, against the VPS."""
     to_sensor = sensor_attitude(matrix(vps, QUATERNION), s)
@@ -218,11 +219,11 @@ def _propagated_against_vps(
     add("attitude_propagated", method, "vps", signal, theil_attitude(continuous(reference), model), "deg")
 
 
-def _smoothed_blocks(t: Array, x: Array, s: Settings) -> Array:
+def _smoothed_blocks(t: Array, x: Array, s: SmoothingSettings) -> Array:
     """Low-pass by contiguous block of the VPS's own grid."""
     out = np.empty_like(x)
     for a, b in contiguous(t, BRIDGE_S):
         out[a:b] = smoothing.smooth_samples(
-            t[a:b], x[a:b], s["smoothing_cutoff_hz"], side_s=s["smoothing_side_s"], ends=s["smoothing_ends"]
+            t[a:b], x[a:b], s.smoothing_cutoff_hz, side_s=s.smoothing_side_s, ends=s.smoothing_ends
         )
     return out

@@ -16,9 +16,9 @@ from fieldcal.estimation.statistics import white_noise_sigma
 from fieldcal.estimation.uncertainty_propagation import attitude_jacobian, constants_to_equation, constants_to_gyro
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
-from fieldcal.stages.attitude import VECTOR_SENSORS, body_vectors, known_vectors, logged_constants, sensor_attitude
+from fieldcal.names import VECTOR_SENSORS, Sensor
+from fieldcal.stages.attitude import body_vectors, known_vectors, logged_constants, sensor_attitude
 from fieldcal.stages.inputs import (
-    Settings,
     Tables,
     differentiate_by_segment,
     mean_temperature,
@@ -27,6 +27,14 @@ from fieldcal.stages.inputs import (
     spread_of,
 )
 from fieldcal.stages.results import StageResult, triad_rows
+from fieldcal.stages.settings import (
+    GyroEquationPass2Settings,
+    GyroEquationSettings,
+    GyroOutputSettings,
+    GyroSettings,
+    LoggedValues,
+    TriadUncertainty,
+)
 from fieldcal.stages.tables import (
     AXES,
     QUATERNION,
@@ -48,11 +56,20 @@ RUN_IN_STRETCH_S = 15.0
 GYRO_REASONS = "Gyroscope axes refused ({axes}): too little rotation about them, or polarity and units that contradict."
 
 
-def calibrate_gyro_equation(tables: Tables, s: Settings) -> StageResult:
+def calibrate_gyro_equation(tables: Tables, s: GyroEquationSettings) -> StageResult:
     """samples, attitude → calibration of the gyroscope by equation error (Eq. 10–15).
 
-    Noise that smoothing leaves in the readings is taken off the regressor; where the vector triads' covariances are
-    given, what they do to the result is in its sd."""
+    Noise that smoothing leaves in the readings is taken off the regressor."""
+    return _equation_error(tables, s, None)
+
+
+def calibrate_gyro_equation_pass2(tables: Tables, s: GyroEquationPass2Settings) -> StageResult:
+    """The same from the second attitude; where the vector triads' covariances are given, what they do to the result is
+    in its sd."""
+    return _equation_error(tables, s, s)
+
+
+def _equation_error(tables: Tables, s: GyroEquationSettings, triads: TriadUncertainty | None) -> StageResult:
     samples, attitude = tables["samples"], tables["attitude"]
     logged = matrix(samples, triad("gyroscope", "smoothed_"))
     if np.isnan(logged).any():
@@ -63,27 +80,27 @@ def calibrate_gyro_equation(tables: Tables, s: Settings) -> StageResult:
         seconds(samples["t_ns"], samples["t_ns"][0]),
         matrix(samples, triad("gyroscope")),
         samples["segment"].to_numpy(),
-        s["smoothing_cutoff_hz"],
-        side_s=s["smoothing_side_s"],
+        s.smoothing_cutoff_hz,
+        side_s=s.smoothing_side_s,
     )
     try:
         fit = equation_error.fit_equation_error(
             q,
-            differentiate_by_segment(samples, q, s["differentiation_window_s"]),
+            differentiate_by_segment(samples, q, s.differentiation_window_s),
             logged,
-            equations=s["equations"],
+            equations=s.equations,
             weights=weight,
             noise_variance=noise_variance,
         )
     except UnusableFlight as error:
         return refusal(error, "gyroscope")
     pairs = []
-    for jacobian, covariance in _triad_uncertainty(tables, s):
+    for jacobian, covariance in [] if triads is None else _triad_uncertainty(tables, triads):
         flat = jacobian.reshape(len(q), -1)
-        derivative = differentiate_by_segment(samples, flat, s["differentiation_window_s"]).reshape(jacobian.shape)
+        derivative = differentiate_by_segment(samples, flat, s.differentiation_window_s).reshape(jacobian.shape)
         pairs.append((jacobian, derivative, covariance))
     rate = fit.scale * logged + fit.bias
-    only_scalar = q if s["equations"] == "scalar" else None
+    only_scalar = q if s.equations == "scalar" else None
     covariance = fit.covariance + constants_to_equation(logged, rate, weight, pairs, only_scalar)
     measured = {
         "residual_rms": fit.residual_rms,
@@ -93,16 +110,16 @@ def calibrate_gyro_equation(tables: Tables, s: Settings) -> StageResult:
 
 
 def _gyro_result(
-    method: str, fit: GyroFit, covariance: Array, tables: Tables, s: Settings, measured: dict[str, Any]
+    method: str, fit: GyroFit, covariance: Array, tables: Tables, s: GyroSettings, measured: dict[str, Any]
 ) -> StageResult:
     """Gyroscope rows with a status by axis: sign against polarity, size against nominal, claimed sd."""
     relative = np.sqrt(np.diagonal(covariance)[:3]) / np.abs(fit.scale)
-    sign_wrong = np.sign(fit.scale) != np.sign(np.asarray(s["polarity"]["gyroscope"], dtype=float))
+    sign_wrong = np.sign(fit.scale) != np.sign(np.asarray(s.polarity[Sensor.GYROSCOPE], dtype=float))
     codes: list[str | None] = [None] * 3
-    nominal = s["nominal_scale"]["gyroscope"]
+    nominal = s.nominal_scale[Sensor.GYROSCOPE]
     for i in range(3):
         ratio = 1.0 if nominal is None else abs(fit.scale[i]) / abs(nominal[i])
-        if not relative[i] <= s["gyro_max_scale_sd"]:
+        if not relative[i] <= s.gyro_max_scale_sd:
             codes[i] = "scale_uncertain"
         elif sign_wrong[i]:
             codes[i] = "polarity_contradiction"
@@ -124,8 +141,8 @@ def _gyro_result(
         fit.bias,
         covariance,
         unit="rad/s",
-        logged_unit=s["units"]["gyroscope"],
-        reference_reading=reference_reading(s, "gyroscope", matrix(tables["samples"], triad("gyroscope"))),
+        logged_unit=s.units[Sensor.GYROSCOPE],
+        reference_reading=reference_reading(s, Sensor.GYROSCOPE, matrix(tables["samples"], triad("gyroscope"))),
         temperature_degc=mean_temperature(tables),
         status=tuple("ok" if c is None else "refused" for c in codes),  # type: ignore[arg-type]
         reason_code=tuple(codes),  # type: ignore[arg-type]
@@ -138,7 +155,7 @@ def _gyro_result(
     return StageResult(result, status, first, reason, measured)
 
 
-def calibrate_gyro_output(tables: Tables, s: Settings) -> StageResult:
+def calibrate_gyro_output(tables: Tables, s: GyroOutputSettings) -> StageResult:
     """samples, attitude, equation-error start → calibration by output error, with the triads' own uncertainty
     propagated.
 
@@ -174,9 +191,9 @@ def _contradicted(equation: pl.DataFrame, output: pl.DataFrame) -> list[str]:
     return pairs["axis"].to_list()
 
 
-def _output_error(tables: Tables, s: Settings) -> StageResult:
+def _output_error(tables: Tables, s: GyroOutputSettings) -> StageResult:
     """Output error's own rows."""
-    if not s["gyro_output"]:
+    if not s.gyro_output:
         return StageResult(status="absent", reason_code="switched_off", reason="Output error is switched off.")
     samples, attitude = tables["samples"], tables["attitude"]
     logged = matrix(samples, triad("gyroscope"))
@@ -184,21 +201,21 @@ def _output_error(tables: Tables, s: Settings) -> StageResult:
     segment, weight = samples["segment"].to_numpy(), attitude["weight"].to_numpy()
     q = sensor_attitude(matrix(attitude, QUATERNION), s)
     start = _start(tables["gyroscope"], t, q, logged, segment, weight, s)
-    stretch_s = s["shooting_s"] or _suitable_stretch(start, t, logged, tables)
+    stretch_s = s.shooting_s or _suitable_stretch(start, t, logged, tables)
     options: dict[str, Any] = {
         "segment": segment,
         "weights": weight,
-        "initial_attitude": s["initial_attitude"],
-        "robust": s["initial_attitude"] == "estimated",
+        "initial_attitude": s.initial_attitude,
+        "robust": s.initial_attitude == "estimated",
     }
     try:
-        if stretch_s > 1.5 * RUN_IN_STRETCH_S and s["initial_attitude"] == "estimated":
+        if stretch_s > 1.5 * RUN_IN_STRETCH_S and s.initial_attitude == "estimated":
             start = output_error.fit_output_error(t, q, logged, start, stretch_s=RUN_IN_STRETCH_S, **options)
         fit = output_error.fit_output_error(t, q, logged, start, stretch_s=stretch_s, **options)
     except EstimationError as error:
         return refusal(error, "gyroscope")
     median = output_error.attitude_error_median(t, q, fit.scale * logged + fit.bias, segment, stretch_s, weight)
-    measured = {
+    measured: dict[str, Any] = {
         "stretch_s": stretch_s,
         "attitude_error_rms_deg": float(np.degrees(fit.residual_rms)),
         "attitude_error_median_deg": float(np.degrees(median)),
@@ -219,7 +236,7 @@ def _output_error(tables: Tables, s: Settings) -> StageResult:
 
 
 def _start(
-    equation: pl.DataFrame, t: Array, q: Array, logged: Array, segment: np.ndarray, weight: Array, s: Settings
+    equation: pl.DataFrame, t: Array, q: Array, logged: Array, segment: np.ndarray, weight: Array, s: LoggedValues
 ) -> GyroFit:
     """The nearer of equation error's constants and, for SI logs, the logged values."""
     values = {(p, a): v for p, a, v in equation.select("parameter", "axis", "value").iter_rows()}
@@ -231,7 +248,7 @@ def _start(
         residual_rms=0.0,
         n_samples=len(t),
     )
-    own = logged_constants(s, "gyroscope")
+    own = logged_constants(s, Sensor.GYROSCOPE)
     if own is None:
         return start
     nominal = replace(start, scale=np.diagonal(own[0]).copy(), bias=own[1])
@@ -252,19 +269,19 @@ def _suitable_stretch(start: GyroFit, t: Array, logged: Array, tables: Tables) -
     )
 
 
-def _triad_uncertainty(tables: Tables, s: Settings) -> list[tuple[Array, Array]]:
+def _triad_uncertainty(tables: Tables, s: TriadUncertainty) -> list[tuple[Array, Array]]:
     """[(directions sensed (n, 3) …)] see `propagation`: one (Jacobian of the attitude, covariance) pair per vector
     triad."""
     if not any(f"{name}_covariance" in tables for name in VECTOR_SENSORS):
         return []
     samples, attitude = tables["samples"], tables["attitude"]
-    axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
     vectors = body_vectors(samples, known_vectors(tables, s), s, prefix="smoothed_")
     spread = (
         spread_of(attitude["field_excess"].to_numpy()),
-        spread_of(attitude["acceleration_excess_mps2"].to_numpy() / s["gravity_mps2"]),
+        spread_of(attitude["acceleration_excess_mps2"].to_numpy() / s.gravity_mps2),
     )
-    sign = {"magnetometer": 1.0, "accelerometer": sensor_model.GRAVITY_SIGNS[s["gravity_sign"]]}
+    sign = {"magnetometer": 1.0, "accelerometer": sensor_model.GRAVITY_SIGNS[s.gravity_sign]}
     pairs = []
     for i, name in enumerate(VECTOR_SENSORS):
         covariance = tables.get(f"{name}_covariance")

@@ -11,12 +11,11 @@ import polars as pl
 from fieldcal.estimation import smoothing
 from fieldcal.geometry.rotation import Array
 from fieldcal.geometry.sensor_model import default_reference_reading
+from fieldcal.names import Sensor
 from fieldcal.stages.results import StageResult, fatal_fault
+from fieldcal.stages.settings import ReferenceReading
 
 Tables = Mapping[str, pl.DataFrame]
-
-
-Settings = Mapping[str, Any]
 
 
 def mean_temperature(tables: Tables) -> float | None:
@@ -40,9 +39,9 @@ def in_used_segments(table: pl.DataFrame, segments: pl.DataFrame) -> np.ndarray:
     return inside
 
 
-def reference_reading(s: Settings, name: str, logged: Array) -> Array:
-    configured = s["reference_reading"][name]
-    return default_reference_reading(logged, s["units"][name]) if configured is None else np.asarray(configured)
+def reference_reading(s: ReferenceReading, name: Sensor, logged: Array) -> Array:
+    configured = s.reference_reading[name]
+    return default_reference_reading(logged, s.units[name]) if configured is None else np.asarray(configured)
 
 
 def differentiate_by_segment(samples: pl.DataFrame, x: Array, window_s: float) -> Array:

@@ -16,10 +16,12 @@ from fieldcal.estimation.joint.measurement_model import body_jumps
 from fieldcal.estimation.joint.problem import TERMS, Readings
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, from_matrix, multiply
+from fieldcal.names import SENSORS, Approach, Sensor
 from fieldcal.stages.attitude import logged_constants
-from fieldcal.stages.inputs import Settings, Tables, is_sound, mean_temperature, reference_reading, refusal
+from fieldcal.stages.inputs import Tables, is_sound, mean_temperature, reference_reading, refusal
 from fieldcal.stages.joint_reference import Poses, poses_of, with_poses
 from fieldcal.stages.results import StageResult, fatal_fault, triad_rows, zero_slope_rows
+from fieldcal.stages.settings import JointSettings
 from fieldcal.stages.tables import (
     AXES,
     QUATERNION,
@@ -33,20 +35,19 @@ from fieldcal.stages.tables import (
 )
 
 METHOD = "joint"
-SENSORS = ("magnetometer", "accelerometer", "gyroscope")
-SERIAL_METHODS: dict[str, tuple[str | None, ...]] = {
-    "magnetometer": (None,),
-    "accelerometer": (None,),
-    "gyroscope": ("output_error", "equation_error"),
+SERIAL_METHODS: dict[Sensor, tuple[str | None, ...]] = {
+    Sensor.MAGNETOMETER: (None,),
+    Sensor.ACCELEROMETER: (None,),
+    Sensor.GYROSCOPE: ("output_error", "equation_error"),
 }
-UNITS = {"magnetometer": "", "accelerometer": "m/s^2", "gyroscope": "rad/s"}
+UNITS = {Sensor.MAGNETOMETER: "", Sensor.ACCELEROMETER: "m/s^2", Sensor.GYROSCOPE: "rad/s"}
 # A magnetometer's readings count as one each only where they are about as many as the gyroscope's.
 SPARSE = 0.9
 HELD_IN_SHARE = 0.7
 MAX_GYRO_NOISE_SHARE = 0.5
 
 
-def estimate_jointly(tables: Tables, s: Settings) -> StageResult:
+def estimate_jointly(tables: Tables, s: JointSettings) -> StageResult:
     """samples, serial constants → calibration, covariance, trajectory, held_out: everything in one likelihood."""
     if not chosen(s):
         return StageResult(status="absent", reason_code="not_selected", reason='The method is "serial".')
@@ -58,8 +59,8 @@ def estimate_jointly(tables: Tables, s: Settings) -> StageResult:
     if tables["samples"]["gyroscope_x"].null_count():
         return StageResult(status="refused", reason_code="no_gyroscope", reason="The joint estimate needs a gyroscope.")
     readings = readings_of(tables, s)
-    axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
-    arm = None if s["lever_arm_m"] is None else axes.T @ np.asarray(s["lever_arm_m"], dtype=float)
+    axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
+    arm = None if s.lever_arm_m is None else axes.T @ np.asarray(s.lever_arm_m, dtype=float)
     try:
         model, start = initialise.prepare(readings, start_constants(tables, s, readings), lever_arm=arm)
         fit = fit_joint(model, start, try_lever_arm=arm is None)
@@ -76,22 +77,23 @@ def estimate_jointly(tables: Tables, s: Settings) -> StageResult:
     )
 
 
-def chosen(s: Settings) -> tuple[str, ...]:
-    """Sensors whose constants this method is to give: `method` names one for all, or one for each."""
-    method = s["method"]
-    return tuple(name for name in SENSORS if (method if isinstance(method, str) else method[name]) == METHOD)
+def chosen(s: JointSettings) -> tuple[Sensor, ...]:
+    """Sensors whose constants this method is to give."""
+    return tuple(name for name in SENSORS if s.method[name] == Approach.JOINT)
 
 
 def _held_out(
-    fit: JointFit, readings: Readings, tables: Tables, s: Settings, arm: Array | None, poses: Poses | None
+    fit: JointFit, readings: Readings, tables: Tables, s: JointSettings, arm: Array | None, poses: Poses | None
 ) -> dict[str, pl.DataFrame]:
     """Gyroscope constants from the first part of the flight alone, with `from_ns`, where the rest begins: `verify`
     predicts that. None where the part determines nothing, or another method gives the gyroscope's."""
-    if "gyroscope" not in chosen(s):
+    if Sensor.GYROSCOPE not in chosen(s):
         return {}
     split = int(HELD_IN_SHARE * len(readings.t))
     part = readings.part(slice(0, split))
-    known = {name: fit.constants(name)[:2] for name in SENSORS if name in fit.layout}
+    known: dict[str, tuple[Array, Array] | None] = {
+        name: fit.constants(name)[:2] for name in SENSORS if name in fit.layout
+    }
     try:
         own = fit_joint(*initialise.prepare(part, known, lever_arm=arm), try_lever_arm=arm is None)
         own, _ = with_poses(own, poses, s)
@@ -107,20 +109,20 @@ def _held_out(
         bias,
         covariance,
         unit="rad/s",
-        logged_unit=s["units"]["gyroscope"],
-        reference_reading=reference_reading(s, "gyroscope", readings.gyroscope),
+        logged_unit=s.units[Sensor.GYROSCOPE],
+        reference_reading=reference_reading(s, Sensor.GYROSCOPE, readings.gyroscope),
         temperature_degc=mean_temperature(tables),
     )
     return {"held_out": calibration_rows(rows).with_columns(from_ns=pl.lit(int(tables["samples"]["t_ns"][split])))}
 
 
-def readings_of(tables: Tables, s: Settings) -> Readings:
+def readings_of(tables: Tables, s: JointSettings) -> Readings:
     """Logged readings of the used segments; a slow magnetometer's only at the samples nearest to its
     own stamps; none of a triad with a fatal fault."""
     samples = tables["samples"]
     t = seconds(samples["t_ns"], samples["t_ns"][0])
     segment = samples["segment"].to_numpy()
-    logged = {name: matrix(samples, triad(name)) for name in SENSORS}
+    logged: dict[str, Array] = {name: matrix(samples, triad(name)) for name in SENSORS}
     magnetometer = tables.get("magnetometer_log")
     if magnetometer is not None and len(magnetometer) < SPARSE * len(tables["imu"]):
         own = np.zeros(len(t), dtype=bool)
@@ -136,8 +138,8 @@ def readings_of(tables: Tables, s: Settings) -> Readings:
         t=t,
         segment=segment,
         gyroscope=logged["gyroscope"],
-        gravity_mps2=sensor_model.GRAVITY_SIGNS[s["gravity_sign"]] * s["gravity_mps2"],
-        field_ned=np.asarray(s["field_ned"], dtype=float),
+        gravity_mps2=sensor_model.GRAVITY_SIGNS[s.gravity_sign] * s.gravity_mps2,
+        field_ned=np.asarray(s.field_ned, dtype=float),
         turning=initialise.turning(t, segment, logged["gyroscope"]),
         **given,
     )
@@ -153,10 +155,13 @@ def _warmth(tables: Tables, t: Array) -> Array | None:
     return np.asarray(warm - warm.mean())
 
 
-def start_constants(tables: Tables, s: Settings, readings: Readings) -> dict[str, tuple[Array, Array] | None]:
+def start_constants(tables: Tables, s: JointSettings, readings: Readings) -> dict[str, tuple[Array, Array] | None]:
     """The serial chain's constants where it has them, else what the logged unit says, else refused values, else own."""
     out: dict[str, tuple[Array, Array] | None] = {}
-    magnitudes = {"magnetometer": float(np.linalg.norm(s["field_ned"])), "accelerometer": s["gravity_mps2"]}
+    magnitudes = {
+        Sensor.MAGNETOMETER: float(np.linalg.norm(s.field_ned)),
+        Sensor.ACCELEROMETER: s.gravity_mps2,
+    }
     for name in SENSORS:
         found = None
         for method in SERIAL_METHODS[name]:
@@ -166,15 +171,15 @@ def start_constants(tables: Tables, s: Settings, readings: Readings) -> dict[str
         out[name] = None if found is None else (np.diagonal(found[0]).copy(), found[1])
         logged = getattr(readings, name)
         if out[name] is None and name in magnitudes and logged is not None:
-            polarity = np.asarray(s["polarity"][name], dtype=float)
+            polarity = np.array(s.polarity[name], dtype=np.float64)
             out[name] = initialise.start_of_triad(logged, magnitudes[name], polarity)
     return out
 
 
-def _written(fit: JointFit, tables: Tables, s: Settings, axes: Array) -> StageResult:
+def _written(fit: JointFit, tables: Tables, s: JointSettings, axes: Array) -> StageResult:
     """Rows with a status by sensor and axis, the attitude, the covariance, and the numbers that decided."""
     rows: list[dict[str, Any]] = []
-    codes: dict[str, list[str | None]] = {}
+    codes: dict[Sensor, list[str | None]] = {}
     for name in chosen(s):
         if name not in fit.layout:
             continue
@@ -186,16 +191,16 @@ def _written(fit: JointFit, tables: Tables, s: Settings, axes: Array) -> StageRe
             full,
             bias,
             covariance,
-            unit=UNITS[name] or s["field_unit"],
-            logged_unit=s["units"][name],
+            unit=UNITS[name] or s.field_unit,
+            logged_unit=s.units[name],
             reference_reading=reference_reading(s, name, matrix(tables["samples"], triad(name))),
             temperature_degc=mean_temperature(tables),
             status=tuple("refused" if code else "ok" for code in codes[name]),  # type: ignore[arg-type]
             reason_code=tuple(codes[name]),  # type: ignore[arg-type]
             cross_sd=cross_sd,
         )
-    if "gyroscope" in codes:
-        rows += _slope_rows(fit, tables, s, codes["gyroscope"])
+    if Sensor.GYROSCOPE in codes:
+        rows += _slope_rows(fit, tables, s, codes[Sensor.GYROSCOPE])
     bad = [f"{name} {axis}: {c}" for name, own in codes.items() for axis, c in zip(AXES, own, strict=True) if c]
     every = len(bad) == 3 * len(codes)
     measured = _measured(fit, axes)
@@ -205,7 +210,7 @@ def _written(fit: JointFit, tables: Tables, s: Settings, axes: Array) -> StageRe
         first, reason = f"no_{chosen(s)[0]}", "None of the sensors that method joint is chosen for has readings."
     result = {"calibration": calibration_rows(rows), "covariance": covariance_table(fit.covariance)}
     full, _, covariance, _ = _triad(fit, "gyroscope")
-    if not any(_judged("gyroscope", fit, np.diagonal(full), covariance, s)):
+    if not any(_judged(Sensor.GYROSCOPE, fit, np.diagonal(full), covariance, s)):
         result["trajectory"] = _trajectory(fit, tables, axes)
     return StageResult(result, "refused" if every else "ok", first, reason, measured)
 
@@ -221,7 +226,7 @@ def _triad(fit: JointFit, name: str) -> tuple[Array, Array, Array, Array | None]
     return full, bias, covariance[own], np.sqrt(np.diagonal(covariance)[:9]).reshape(3, 3)
 
 
-def _slope_rows(fit: JointFit, tables: Tables, s: Settings, codes: list[str | None]) -> list[dict[str, Any]]:
+def _slope_rows(fit: JointFit, tables: Tables, s: JointSettings, codes: list[str | None]) -> list[dict[str, Any]]:
     """The gyroscope's zero against temperature, where the flight shows it."""
     if "gyroscope_temperature" not in fit.layout:
         return []
@@ -233,26 +238,26 @@ def _slope_rows(fit: JointFit, tables: Tables, s: Settings, codes: list[str | No
         METHOD,
         value,
         sd,
-        logged_unit=s["units"]["gyroscope"],
+        logged_unit=s.units[Sensor.GYROSCOPE],
         temperature_degc=mean_temperature(tables),
         reason_code=codes,
     )
 
 
-def _judged(name: str, fit: JointFit, scale: Array, covariance: Array, s: Settings) -> list[str | None]:
+def _judged(name: Sensor, fit: JointFit, scale: Array, covariance: Array, s: JointSettings) -> list[str | None]:
     """Why an axis is refused, or None."""
-    if name == "gyroscope":
+    if name == Sensor.GYROSCOPE:
         if gyro_noise_share(fit) > MAX_GYRO_NOISE_SHARE:
             return ["gyro_contradicts_attitude"] * 3
-        limit = s["gyro_max_scale_sd"]
+        limit = s.gyro_max_scale_sd
     else:
-        if misfit(fit, name) > s["ellipsoid_max_residual"]:
+        if misfit(fit, name) > s.ellipsoid_max_residual:
             return ["not_a_sphere"] * 3
-        limit = s["ellipsoid_max_scale_sd"]
+        limit = s.ellipsoid_max_scale_sd
     relative = np.sqrt(np.diagonal(covariance)[:3]) / np.abs(scale)
-    polarity = np.asarray(s["polarity"][name], dtype=float)
-    nominal = s["nominal_scale"][name]
-    noisy = axis_noise_share(fit) > MAX_GYRO_NOISE_SHARE if name == "gyroscope" else np.zeros(3, dtype=bool)
+    polarity = np.array(s.polarity[name], dtype=np.float64)
+    nominal = s.nominal_scale[name]
+    noisy = axis_noise_share(fit) > MAX_GYRO_NOISE_SHARE if name == Sensor.GYROSCOPE else np.zeros(3, dtype=bool)
     out: list[str | None] = []
     for i in range(3):
         ratio = 1.0 if nominal is None else abs(scale[i] / nominal[i])

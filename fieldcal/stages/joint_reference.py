@@ -14,7 +14,8 @@ from fieldcal.estimation.joint.pose_measurement import VpsRecord
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, continuous, to_rotation_vector
 from fieldcal.stages.attitude import sensor_attitude
-from fieldcal.stages.inputs import Settings, Tables
+from fieldcal.stages.inputs import Tables
+from fieldcal.stages.settings import VpsReference
 from fieldcal.stages.tables import QUATERNION, matrix, seconds
 from fieldcal.stages.vps import vps_attitude
 
@@ -30,24 +31,24 @@ class Poses:
     max_gap_s: float
 
 
-def poses_of(tables: Tables, s: Settings) -> Poses | None:
+def poses_of(tables: Tables, s: VpsReference) -> Poses | None:
     """The log's VPS where `use_vps` asks for it and there is one."""
-    if not s["use_vps"] or "vps" not in tables or tables["vps"].is_empty():
+    if not s.use_vps or "vps" not in tables or tables["vps"].is_empty():
         return None
     origin, stamps = int(tables["samples"]["t_ns"][0]), tables["vps"]["t_ns"]
     base_ns = int(stamps[0]) - origin
     length_s = (int(tables["samples"]["t_ns"][-1]) - origin) * 1e-9
-    if abs(base_ns) * 1e-9 <= s["vps_max_lag_s"] + length_s:
+    if abs(base_ns) * 1e-9 <= s.vps_max_lag_s + length_s:
         base_ns = 0
     t, q = seconds(stamps, origin + base_ns), vps_attitude(matrix(tables["vps"], QUATERNION), s)
     keep = by_rates.mask_outliers(t, q)
-    return Poses(t[keep], continuous(sensor_attitude(q[keep], s)), base_ns * 1e-9, s["vps_max_gap_s"])
+    return Poses(t[keep], continuous(sensor_attitude(q[keep], s)), base_ns * 1e-9, s.vps_max_gap_s)
 
 
-def with_poses(fit: JointFit, poses: Poses | None, s: Settings) -> tuple[JointFit, dict[str, Any]]:
+def with_poses(fit: JointFit, poses: Poses | None, s: VpsReference) -> tuple[JointFit, dict[str, Any]]:
     """The fit with the VPS in it, and what was used; as it was, with the reason, where the VPS cannot be used."""
     if poses is None:
-        return fit, {"use_vps": False} if s["use_vps"] else {}
+        return fit, {"use_vps": False} if s.use_vps else {}
     readings = fit.model.readings
     scale, bias, _ = fit.constants("gyroscope")
     try:
@@ -56,8 +57,8 @@ def with_poses(fit: JointFit, poses: Poses | None, s: Settings) -> tuple[JointFi
             sensor_model.calibrate(readings.gyroscope, scale, bias),
             poses.t,
             poses.q,
-            max_lag_s=s["vps_max_lag_s"],
-            min_peak=s["vps_min_peak"],
+            max_lag_s=s.vps_max_lag_s,
+            min_peak=s.vps_min_peak,
             max_gap_s=poses.max_gap_s,
         )
         vps = VpsRecord.of(poses.t, poses.q, clock, fit.model, fit.state, fit.path, max_gap_s=poses.max_gap_s)

@@ -13,8 +13,10 @@ from fieldcal.estimation import ellipsoid, motor_field
 from fieldcal.estimation.faults import Fault
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
-from fieldcal.stages.inputs import Settings, Tables, in_used_segments
+from fieldcal.names import Sensor
+from fieldcal.stages.inputs import Tables, in_used_segments
 from fieldcal.stages.results import fatal_fault
+from fieldcal.stages.settings import VectorsSettings
 from fieldcal.stages.tables import constants, matrix, triad
 
 PAUSE_S = 1.0
@@ -28,7 +30,7 @@ DRIVES = {"current_a": ("current", "A"), "throttle": ("throttle", "")}
 """What drives the motors, the better one first: column → word and unit."""
 
 
-def check_motor_field(tables: Tables, s: Settings) -> tuple[dict[str, Any], list[Fault]]:
+def check_motor_field(tables: Tables, s: VectorsSettings) -> tuple[dict[str, Any], list[Fault]]:
     """power, readings and constants of the magnetometer → measured numbers and faults; both empty without a current
     and where the readings are insane already."""
     if not {"power", "readings", "segments"} <= tables.keys():
@@ -53,22 +55,22 @@ def check_motor_field(tables: Tables, s: Settings) -> tuple[dict[str, Any], list
         rows = np.flatnonzero(whole & np.isfinite(drive))
         rows = rows[:: 1 + len(rows) // MOST_SAMPLES]
         field = sensor_model.calibrate(values[rows], *known)
-        found = motor_field.motor_field(field, drive[rows], float(np.linalg.norm(s["field_ned"])))
+        found = motor_field.motor_field(field, drive[rows], float(np.linalg.norm(s.field_ned)))
         if found is None:
             continue
-        fault = motor_field.motor_fault(found, word, unit, s["field_unit"])
+        fault = motor_field.motor_fault(found, word, unit, s.field_unit)
         numbers = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(found).items()}
         return {"motor_field": {"drive": column, **numbers}}, [fault] if fault else []
     return {}, []
 
 
-def _approximate(tables: Tables, s: Settings, values: Array) -> tuple[Array, Array] | None:
+def _approximate(tables: Tables, s: VectorsSettings, values: Array) -> tuple[Array, Array] | None:
     """Scale and bias to start from: the magnetometer's, of a refused fit too (the current may be why it was refused),
     else the algebraic fit's; what a constant ellipsoid lacks is fitted beside the current's field."""
     own = constants(tables["magnetometer"], "magnetometer", refused_too=True) if "magnetometer" in tables else None
     if own is not None and all(np.isfinite(c).all() for c in own):
         return own
-    strength, polarity = float(np.linalg.norm(s["field_ned"])), s["polarity"]["magnetometer"]
+    strength, polarity = float(np.linalg.norm(s.field_ned)), s.polarity[Sensor.MAGNETOMETER]
     try:
         fit = ellipsoid.fit_ellipsoid(values, strength, method="li", polarity=polarity)
     except (UnusableFlight, EstimationError, ValueError):

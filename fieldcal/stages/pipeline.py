@@ -12,121 +12,139 @@ from typing import Any
 
 import polars as pl
 
+from fieldcal.config.flight_settings import FlightSettings
+from fieldcal.names import VECTOR_SENSORS, Sensor
 from fieldcal.schemas import SchemaMismatch, conform
 from fieldcal.stages import attitude, comparison, gyroscope, joint, preparation, sanity, vector_triads, vps, warm_up
+from fieldcal.stages.inputs import Tables
 from fieldcal.stages.results import StageResult, fatal_fault
-
-Run = Callable[[Mapping[str, pl.DataFrame], Mapping[str, Any]], StageResult]
+from fieldcal.stages.settings import (
+    AccelerometerSettings,
+    AttitudeSettings,
+    GatedAccelerometerSettings,
+    GyroEquationPass2Settings,
+    GyroEquationSettings,
+    GyroOutputSettings,
+    JointSettings,
+    MagnetometerSettings,
+    ManoeuvreSettings,
+    S,
+    SanitySettings,
+    SmoothingSettings,
+    StageSettings,
+    VectorsSettings,
+    VerifySettings,
+    VpsSyncSettings,
+    WarmUpSettings,
+    names_of,
+    taken_from,
+)
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage: `reads` maps the function's own names to `stage.table`, `needs` are those it cannot do without,
-    `trusts` the sensors that must be free of fatal faults."""
+    """One stage: `takes` is its part of the flight's settings, `reads` maps the function's own names to `stage.table`,
+    `needs` are those it cannot do without, `trusts` the sensors that must be free of fatal faults."""
 
     name: str
-    function: Run
+    function: Callable[[Tables, Any], StageResult]
+    takes: type[StageSettings]
     reads: Mapping[str, str]
     needs: tuple[str, ...]
     writes: tuple[str, ...]
-    settings: tuple[str, ...]
-    trusts: tuple[str, ...] = ()
+    trusts: tuple[Sensor, ...]
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """Names of the settings that enter its run key."""
+        return names_of(self.takes)
+
+
+def _stage(
+    name: str,
+    function: Callable[[Tables, S], StageResult],
+    takes: type[S],
+    reads: Mapping[str, str],
+    needs: tuple[str, ...],
+    writes: tuple[str, ...],
+    trusts: tuple[Sensor, ...] = (),
+) -> Stage:
+    """A stage whose function takes the settings that it is given."""
+    return Stage(name, function, takes, reads, needs, writes, trusts)
 
 
 INGEST = "ingest"
 
-ELLIPSOID = (
-    "ellipsoid",
-    "ellipsoid_max_condition",
-    "ellipsoid_max_scale_sd",
-    "ellipsoid_max_residual",
-    "polarity",
-    "units",
-    "nominal_scale",
-    "reference_reading",
-)
-AXES = ("rotation_body_from_sensor", "body")
-SMOOTHING = ("smoothing_cutoff_hz", "smoothing_ends", "smoothing_side_s")
-VECTORS = ("attitude", "field_ned", "gravity_mps2", "gravity_sign", "nominal_scale", "polarity", "units", *AXES)
-GYRO = ("gyro_max_scale_sd", "nominal_scale", "polarity", "units", "reference_reading", *AXES)
-EQUATION = ("equations", "differentiation_window_s", "smoothing_cutoff_hz", "smoothing_side_s")
-VPS = ("world", "vps_max_lag_s", "vps_min_peak", "vps_max_gap_s")
 FAULTS = {"faults": "sanity.faults"}
 SAMPLES = {"samples": "smoothing.samples", "temperature": "ingest.temperature", **FAULTS}
 MAGNETOMETER = {"magnetometer": "magnetometer.calibration", "magnetometer_covariance": "magnetometer.covariance"}
 
 PIPELINE: tuple[Stage, ...] = (
-    Stage(
+    _stage(
         "sanity",
         sanity.check_sensors,
+        SanitySettings,
         {"imu": "ingest.imu", "magnetometer": "ingest.magnetometer"},
         (),
         ("faults",),
-        ("units", "nominal_scale", "field_ned", "field_unit", "gravity_mps2"),
     ),
-    Stage(
+    _stage(
         "manoeuvre",
         preparation.find_manoeuvre,
+        ManoeuvreSettings,
         {"imu": "ingest.imu"},
         ("imu",),
         ("segments",),
-        (
-            "manoeuvre_window_s",
-            "manoeuvre_pad_s",
-            "manoeuvre_rest_s",
-            "manoeuvre_min_s",
-            "manoeuvre_max_gap_s",
-            "manoeuvre_excited_ratio",
-        ),
     ),
-    Stage(
+    _stage(
         "smoothing",
         preparation.smooth,
+        SmoothingSettings,
         {"imu": "ingest.imu", "magnetometer": "ingest.magnetometer", "segments": "manoeuvre.segments"},
         ("imu", "segments"),
         ("samples",),
-        SMOOTHING,
     ),
-    Stage(
+    _stage(
         "magnetometer",
         vector_triads.calibrate_magnetometer,
+        MagnetometerSettings,
         {**SAMPLES, "magnetometer": "ingest.magnetometer", "segments": "manoeuvre.segments"},
         ("samples", "segments"),
         ("calibration", "covariance"),
-        (*ELLIPSOID, "field_ned", "field_unit"),
-        ("magnetometer",),
+        (Sensor.MAGNETOMETER,),
     ),
-    Stage(
+    _stage(
         "accelerometer",
         vector_triads.calibrate_accelerometer,
+        AccelerometerSettings,
         SAMPLES,
         ("samples",),
         ("calibration", "covariance"),
-        (*ELLIPSOID, "gravity_mps2"),
-        ("accelerometer",),
+        (Sensor.ACCELEROMETER,),
     ),
-    Stage(
+    _stage(
         "attitude",
         attitude.estimate_attitude,
+        AttitudeSettings,
         {**SAMPLES, **MAGNETOMETER, "accelerometer": "accelerometer.calibration"},
         ("samples",),
         ("attitude", "faults"),
-        (*VECTORS, "field_source"),
-        attitude.VECTOR_SENSORS,
+        VECTOR_SENSORS,
     ),
-    Stage(
+    _stage(
         "gyro_equation",
         gyroscope.calibrate_gyro_equation,
+        GyroEquationSettings,
         {**SAMPLES, "attitude": "attitude.attitude"},
         ("samples", "attitude"),
         ("calibration", "covariance"),
-        (*GYRO, *EQUATION),
-        ("gyroscope",),
+        (Sensor.GYROSCOPE,),
     ),
     # Second pass, now with rates: lever arm (Eq. 3) and sample gate.
-    Stage(
+    _stage(
         "accelerometer_pass2",
         vector_triads.calibrate_accelerometer_gated,
+        GatedAccelerometerSettings,
         {
             **SAMPLES,
             "accelerometer": "accelerometer.calibration",
@@ -134,30 +152,21 @@ PIPELINE: tuple[Stage, ...] = (
         },
         ("samples",),
         ("calibration", "covariance"),
-        (
-            *ELLIPSOID,
-            *AXES,
-            "gravity_mps2",
-            "gravity_sign",
-            "lever_arm_m",
-            "gate_norm",
-            "gate_rate_radps",
-            "differentiation_window_s",
-        ),
-        ("accelerometer",),
+        (Sensor.ACCELEROMETER,),
     ),
-    Stage(
+    _stage(
         "attitude_pass2",
         attitude.estimate_attitude,
+        AttitudeSettings,
         {**SAMPLES, **MAGNETOMETER, "accelerometer": "accelerometer_pass2.calibration"},
         ("samples",),
         ("attitude", "faults"),
-        (*VECTORS, "field_source"),
-        attitude.VECTOR_SENSORS,
+        VECTOR_SENSORS,
     ),
-    Stage(
+    _stage(
         "vectors",
         vector_triads.judge_vectors,
+        VectorsSettings,
         {
             "magnetometer": "magnetometer.calibration",
             "accelerometer": "accelerometer_pass2.calibration",
@@ -169,11 +178,11 @@ PIPELINE: tuple[Stage, ...] = (
         },
         (),
         ("calibration", "faults"),
-        ("field_ned", "field_unit", "polarity"),
     ),
-    Stage(
+    _stage(
         "gyro_equation_pass2",
-        gyroscope.calibrate_gyro_equation,
+        gyroscope.calibrate_gyro_equation_pass2,
+        GyroEquationPass2Settings,
         {
             **SAMPLES,
             **MAGNETOMETER,
@@ -184,12 +193,12 @@ PIPELINE: tuple[Stage, ...] = (
         },
         ("samples", "attitude"),
         ("calibration", "covariance"),
-        (*GYRO, *VECTORS, *EQUATION),
-        ("gyroscope",),
+        (Sensor.GYROSCOPE,),
     ),
-    Stage(
+    _stage(
         "gyro_output",
         gyroscope.calibrate_gyro_output,
+        GyroOutputSettings,
         {
             **SAMPLES,
             **MAGNETOMETER,
@@ -200,12 +209,12 @@ PIPELINE: tuple[Stage, ...] = (
         },
         ("samples", "attitude", "gyroscope"),
         ("calibration", "covariance"),
-        (*GYRO, *VECTORS, "gyro_output", "initial_attitude", "shooting_s"),
-        ("gyroscope",),
+        (Sensor.GYROSCOPE,),
     ),
-    Stage(
+    _stage(
         "warm_up",
         warm_up.find_warm_up,
+        WarmUpSettings,
         {
             "imu": "ingest.imu",
             "temperature": "ingest.temperature",
@@ -214,12 +223,12 @@ PIPELINE: tuple[Stage, ...] = (
         },
         ("imu",),
         ("calibration",),
-        ("units", "manoeuvre_max_gap_s"),
-        ("gyroscope",),
+        (Sensor.GYROSCOPE,),
     ),
-    Stage(
+    _stage(
         "joint",
         joint.estimate_jointly,
+        JointSettings,
         {
             **SAMPLES,
             "imu": "ingest.imu",
@@ -232,28 +241,11 @@ PIPELINE: tuple[Stage, ...] = (
         },
         (),
         ("calibration", "covariance", "trajectory", "held_out"),
-        (
-            *AXES,
-            "method",
-            "polarity",
-            "units",
-            "nominal_scale",
-            "reference_reading",
-            "field_ned",
-            "field_unit",
-            "gravity_mps2",
-            "gravity_sign",
-            "lever_arm_m",
-            "ellipsoid_max_scale_sd",
-            "ellipsoid_max_residual",
-            "gyro_max_scale_sd",
-            "use_vps",
-            *VPS,
-        ),
     ),
-    Stage(
+    _stage(
         "vps_sync",
         vps.synchronise_vps,
+        VpsSyncSettings,
         {
             "imu": "ingest.imu",
             "vps": "ingest.vps",
@@ -267,12 +259,12 @@ PIPELINE: tuple[Stage, ...] = (
         },
         ("imu",),
         ("sync", "vps_aligned"),
-        (*AXES, "polarity", "nominal_scale", *VPS),
-        ("gyroscope",),
+        (Sensor.GYROSCOPE,),
     ),
-    Stage(
+    _stage(
         "verify",
         comparison.verify_fit,
+        VerifySettings,
         {
             **SAMPLES,
             "magnetometer": "magnetometer.calibration",
@@ -286,7 +278,6 @@ PIPELINE: tuple[Stage, ...] = (
         },
         ("samples",),
         ("fit",),
-        (*VECTORS, *SMOOTHING, "differentiation_window_s", "initial_attitude"),
     ),
 )
 
@@ -303,11 +294,11 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
 }
 
 
-def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: Mapping[str, Any]) -> StageResult:
+def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: FlightSettings) -> StageResult:
     """Run one stage on `stage.table` tables; missing needs end as a refusal that names them."""
     inputs = {own: tables[name] for own, name in stage.reads.items() if name in tables}
     # An attitude is as good as the vectors that it came from.
-    for faults, sensors in (("faults", stage.trusts), ("attitude_faults", attitude.VECTOR_SENSORS)):
+    for faults, sensors in (("faults", stage.trusts), ("attitude_faults", VECTOR_SENSORS)):
         fault = fatal_fault(inputs[faults], sensors) if faults in inputs else None
         if fault is not None:
             return StageResult(
@@ -324,7 +315,7 @@ def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: Mappin
                 reason_code=f"no_{need}",
                 reason=f"{stage.name} needs {stage.reads[need]}, which {source} could not give.",
             )
-    result = stage.function(inputs, {name: settings[name] for name in stage.settings})
+    result = stage.function(inputs, taken_from(settings, stage.takes))
     _check_written(stage, result)
     return result
 
@@ -337,7 +328,7 @@ def _check_written(stage: Stage, result: StageResult) -> None:
         conform(frame.to_arrow(), name, stage=True)
 
 
-def run_flight(signals: Mapping[str, pl.DataFrame], settings: Mapping[str, Any]) -> dict[str, StageResult]:
+def run_flight(signals: Mapping[str, pl.DataFrame], settings: FlightSettings) -> dict[str, StageResult]:
     """All stages of one flight, in memory: signal table name → frame in, stage name → result out."""
     tables = {f"ingest.{name}": frame for name, frame in signals.items()}
     results: dict[str, StageResult] = {}

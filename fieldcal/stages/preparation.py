@@ -9,8 +9,9 @@ import polars as pl
 
 from fieldcal.estimation import motion_selection, smoothing
 from fieldcal.geometry.rotation import Array
-from fieldcal.stages.inputs import Settings, Tables
+from fieldcal.stages.inputs import Tables
 from fieldcal.stages.results import StageResult
+from fieldcal.stages.settings import ManoeuvreSettings, SmoothingSettings
 from fieldcal.stages.tables import columns_of, matrix, seconds, triad
 
 SHORTEST_STRETCH = 10
@@ -19,7 +20,7 @@ MAGNETOMETER_PAUSE = 5.0
 """A magnetometer is interpolated over so many of its intervals, and over MAGNETOMETER_PAUSE_S, at the most."""
 
 
-def find_manoeuvre(tables: Tables, s: Settings) -> StageResult:
+def find_manoeuvre(tables: Tables, s: ManoeuvreSettings) -> StageResult:
     """imu → segments: the stretches worth calibrating on, and why."""
     imu = tables["imu"]
     t = seconds(imu["t_ns"], imu["t_ns"][0])
@@ -28,12 +29,12 @@ def find_manoeuvre(tables: Tables, s: Settings) -> StageResult:
     found = motion_selection.select(
         t,
         rate_or_none,
-        window_s=s["manoeuvre_window_s"],
-        pad_s=s["manoeuvre_pad_s"],
-        rest_s=s["manoeuvre_rest_s"],
-        min_s=s["manoeuvre_min_s"],
-        max_gap_s=s["manoeuvre_max_gap_s"],
-        excited_ratio=s["manoeuvre_excited_ratio"],
+        window_s=s.manoeuvre_window_s,
+        pad_s=s.manoeuvre_pad_s,
+        rest_s=s.manoeuvre_rest_s,
+        min_s=s.manoeuvre_min_s,
+        max_gap_s=s.manoeuvre_max_gap_s,
+        excited_ratio=s.manoeuvre_excited_ratio,
     )
     stamps = imu["t_ns"].to_numpy()
     segments = pl.DataFrame(
@@ -57,19 +58,19 @@ def find_manoeuvre(tables: Tables, s: Settings) -> StageResult:
         "rate_threshold": found.threshold,
         "rate_noise": found.noise,
     }
-    if found.excited_s < s["manoeuvre_min_s"]:
+    if found.excited_s < s.manoeuvre_min_s:
         return StageResult(
             {"segments": segments.with_columns(used=pl.lit(False))},
             "refused",
             "too_little_motion",
-            f"Only {found.excited_s:.1f} s of rotation were found, {s['manoeuvre_min_s']:.0f} s are needed: fly the"
+            f"Only {found.excited_s:.1f} s of rotation were found, {s.manoeuvre_min_s:.0f} s are needed: fly the"
             " manoeuvre (roll, pitch and yaw doublets).",
             measured,
         )
     return StageResult({"segments": segments}, measured=measured)
 
 
-def smooth(tables: Tables, s: Settings) -> StageResult:
+def smooth(tables: Tables, s: SmoothingSettings) -> StageResult:
     """imu, magnetometer, segments → samples: readings of the used segments at the IMU's stamps, logged and smoothed."""
     imu, segments = tables["imu"], tables["segments"].filter(pl.col("used"))
     if segments.is_empty():
@@ -86,7 +87,7 @@ def smooth(tables: Tables, s: Settings) -> StageResult:
         smoothed = np.full_like(x, np.nan)
         known = ~np.isnan(x).any(axis=0)
         smoothed[:, known] = smoothing.smooth_samples(
-            t, x[:, known], s["smoothing_cutoff_hz"], side_s=s["smoothing_side_s"], ends=s["smoothing_ends"]
+            t, x[:, known], s.smoothing_cutoff_hz, side_s=s.smoothing_side_s, ends=s.smoothing_ends
         )
         parts.append({"t_ns": stamps[rows], "segment": np.full(len(x), number, dtype=np.int32), "x": x, "s": smoothed})
     if not parts:

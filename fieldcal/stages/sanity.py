@@ -8,17 +8,20 @@ from fieldcal.estimation import faults
 from fieldcal.estimation.faults import Fault
 from fieldcal.geometry.earth_field import UNIT_IN_TESLA
 from fieldcal.geometry.rotation import Array
-from fieldcal.stages.inputs import Settings, Tables
+from fieldcal.names import Sensor
+from fieldcal.stages.inputs import Tables
 from fieldcal.stages.results import StageResult, fault_rows
+from fieldcal.stages.settings import SanitySettings
 from fieldcal.stages.tables import matrix, seconds, triad
 
-SENSORS = {"gyroscope": "imu", "accelerometer": "imu", "magnetometer": "magnetometer"}
+TABLE_OF = {Sensor.GYROSCOPE: "imu", Sensor.ACCELEROMETER: "imu", Sensor.MAGNETOMETER: "magnetometer"}
+"""In the order in which faults are told."""
 
 
-def check_sensors(tables: Tables, s: Settings) -> StageResult:
+def check_sensors(tables: Tables, s: SanitySettings) -> StageResult:
     """imu, magnetometer → faults: what is wrong with a channel or triad, with the number that says so."""
     found: list[Fault] = []
-    for sensor, table in SENSORS.items():
+    for sensor, table in TABLE_OF.items():
         if table not in tables:
             continue
         readings = matrix(tables[table], triad(sensor))
@@ -36,18 +39,18 @@ def check_sensors(tables: Tables, s: Settings) -> StageResult:
     )
 
 
-def _faults_of(sensor: str, t: Array, readings: Array, s: Settings) -> list[Fault]:
-    unit, nominal = s["units"][sensor], s["nominal_scale"][sensor]
-    si_scale = None if unit == "counts" or nominal is None or sensor == "magnetometer" else float(nominal[0])
+def _faults_of(sensor: Sensor, t: Array, readings: Array, s: SanitySettings) -> list[Fault]:
+    unit, nominal = s.units[sensor], s.nominal_scale[sensor]
+    si_scale = None if unit == "counts" or nominal is None or sensor == Sensor.MAGNETOMETER else float(nominal[0])
     found = faults.channel_faults(sensor, t, readings, unit, si_scale)
     wrong: Fault | None = None
-    if sensor == "magnetometer" and unit in UNIT_IN_TESLA:
-        length = float(np.linalg.norm(s["field_ned"]))
-        field = length * UNIT_IN_TESLA[s["field_unit"]] if s["field_unit"] in UNIT_IN_TESLA else None
+    if sensor == Sensor.MAGNETOMETER and unit in UNIT_IN_TESLA:
+        length = float(np.linalg.norm(s.field_ned))
+        field = length * UNIT_IN_TESLA[s.field_unit] if s.field_unit in UNIT_IN_TESLA else None
         wrong = faults.magnetometer_unit(readings, unit, UNIT_IN_TESLA[unit], field)
-    elif sensor == "accelerometer" and si_scale is not None:
-        wrong = faults.accelerometer_unit(readings, unit, si_scale, s["gravity_mps2"])
-    elif sensor == "gyroscope" and si_scale is not None:
+    elif sensor == Sensor.ACCELEROMETER and si_scale is not None:
+        wrong = faults.accelerometer_unit(readings, unit, si_scale, s.gravity_mps2)
+    elif sensor == Sensor.GYROSCOPE and si_scale is not None:
         wrong = faults.gyroscope_unit(readings, unit, si_scale)
     dead = any(f.code in ("all_zero", "stuck") and f.fatal for f in found)
     return [*found, *([wrong] if wrong and not dead else []), *faults.sampling_faults(sensor, t)]

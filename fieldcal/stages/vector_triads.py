@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,9 @@ from fieldcal.estimation import ellipsoid, motion_selection
 from fieldcal.estimation.ellipsoid import TriadFit
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import VECTOR_SENSORS, Sensor, Triple
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import (
-    Settings,
     Tables,
     differentiate_by_segment,
     in_used_segments,
@@ -24,6 +25,13 @@ from fieldcal.stages.inputs import (
 )
 from fieldcal.stages.motor_field import check_motor_field
 from fieldcal.stages.results import StageResult, fatal_fault, fault_rows, triad_rows
+from fieldcal.stages.settings import (
+    AccelerometerSettings,
+    EllipsoidSettings,
+    GatedAccelerometerSettings,
+    MagnetometerSettings,
+    VectorsSettings,
+)
 from fieldcal.stages.tables import calibration_rows, constants, covariance_table, matrix, seconds, triad
 
 ELLIPSOID_METHOD = {
@@ -42,30 +50,30 @@ PROVISIONAL = 0.5
 REST_WINDOW_S = 0.5
 
 
-def calibrate_magnetometer(tables: Tables, s: Settings) -> StageResult:
+def calibrate_magnetometer(tables: Tables, s: MagnetometerSettings) -> StageResult:
     """magnetometer, segments → calibration: hard iron and scale from the length of the local field."""
-    strength = float(np.linalg.norm(s["field_ned"]))
+    strength = float(np.linalg.norm(s.field_ned))
     return _ellipsoid_stage(
-        "magnetometer", tables, s, strength, s["field_unit"], _used_readings(tables, "magnetometer")
+        Sensor.MAGNETOMETER, tables, s, strength, s.field_unit, _used_readings(tables, Sensor.MAGNETOMETER)
     )
 
 
-def calibrate_accelerometer(tables: Tables, s: Settings) -> StageResult:
+def calibrate_accelerometer(tables: Tables, s: AccelerometerSettings) -> StageResult:
     """samples → calibration: first pass, every sample. Provisional: it only has to start the second pass, so its
     limits are wide and, where the refinement finds no minimum, the algebraic fit stands in."""
-    wide = {**s, "ellipsoid_max_scale_sd": PROVISIONAL, "ellipsoid_max_residual": PROVISIONAL}
-    logged = _used_readings(tables, "accelerometer")
-    result = _ellipsoid_stage("accelerometer", tables, wide, s["gravity_mps2"], "m/s^2", logged)
+    wide = replace(s, ellipsoid_max_scale_sd=PROVISIONAL, ellipsoid_max_residual=PROVISIONAL)
+    logged = _used_readings(tables, Sensor.ACCELEROMETER)
+    result = _ellipsoid_stage(Sensor.ACCELEROMETER, tables, wide, s.gravity_mps2, "m/s^2", logged)
     if result.reason_code == "ellipsoid_diverged":
         result = _ellipsoid_stage(
-            "accelerometer", tables, {**wide, "ellipsoid": "li"}, s["gravity_mps2"], "m/s^2", logged
+            Sensor.ACCELEROMETER, tables, replace(wide, ellipsoid="li"), s.gravity_mps2, "m/s^2", logged
         )
     return result
 
 
-def _used_readings(tables: Tables, name: str) -> Array | None:
+def _used_readings(tables: Tables, name: Sensor) -> Array | None:
     """Unsmoothed readings (n, 3) of the used segments at the sensor's own stamps; None when the log has none."""
-    if name == "magnetometer":
+    if name == Sensor.MAGNETOMETER:
         table = tables.get("magnetometer")
         if table is None or table.is_empty():
             return None
@@ -76,21 +84,21 @@ def _used_readings(tables: Tables, name: str) -> Array | None:
 
 
 def _ellipsoid_stage(
-    name: str, tables: Tables, s: Settings, magnitude: float, unit: str, logged: Array | None
+    name: Sensor, tables: Tables, s: EllipsoidSettings, magnitude: float, unit: str, logged: Array | None
 ) -> StageResult:
     """Fit, judge, and write rows; a refused fit keeps its numbers."""
     if logged is None:
         return StageResult(status="refused", reason_code=f"no_{name}", reason=f"The log has no {name} readings.")
-    method = s["ellipsoid"]
+    method = s.ellipsoid
     source = logged if method == "robust" else _smoothed_or(tables, name, logged)
     try:
-        fit = ellipsoid.fit_ellipsoid(source, magnitude, method=method, polarity=s["polarity"][name])
+        fit = ellipsoid.fit_ellipsoid(source, magnitude, method=method, polarity=s.polarity[name])
     except (UnusableFlight, EstimationError, ValueError) as error:
         return refusal(error, name)
     return _judged(name, fit, tables, s, unit, logged, {})
 
 
-def _smoothed_or(tables: Tables, name: str, logged: Array) -> Array:
+def _smoothed_or(tables: Tables, name: Sensor, logged: Array) -> Array:
     """Smoothed readings for the algebraic fits (their bias under noise is several per cent on raw counts)."""
     samples = tables.get("samples")
     if samples is None:
@@ -100,7 +108,7 @@ def _smoothed_or(tables: Tables, name: str, logged: Array) -> Array:
 
 
 def _judged(
-    name: str, fit: TriadFit, tables: Tables, s: Settings, unit: str, logged: Array, extra: dict[str, Any]
+    name: Sensor, fit: TriadFit, tables: Tables, s: EllipsoidSettings, unit: str, logged: Array, extra: dict[str, Any]
 ) -> StageResult:
     """Rows of a triad fit, refused ones included, with the numbers that decided."""
     code = reason = None
@@ -108,10 +116,10 @@ def _judged(
     try:
         ellipsoid.require_determined(
             fit,
-            max_condition=s["ellipsoid_max_condition"],
-            max_scale_sd=s["ellipsoid_max_scale_sd"],
-            max_residual=s["ellipsoid_max_residual"],
-            nominal_scale=s["nominal_scale"][name],
+            max_condition=s.ellipsoid_max_condition,
+            max_scale_sd=s.ellipsoid_max_scale_sd,
+            max_residual=s.ellipsoid_max_residual,
+            nominal_scale=s.nominal_scale[name],
         )
     except UnusableFlight as refusal:
         code, reason = refusal.reason_code, f"{name.capitalize()}: {refusal}"
@@ -119,12 +127,12 @@ def _judged(
     status = "ok" if code is None else "refused"
     rows = triad_rows(
         name,
-        ELLIPSOID_METHOD[s["ellipsoid"]],
+        ELLIPSOID_METHOD[s.ellipsoid],
         fit.scale,
         fit.bias,
         fit.covariance,
         unit=unit,
-        logged_unit=s["units"][name],
+        logged_unit=s.units[name],
         reference_reading=reference_reading(s, name, logged),
         temperature_degc=mean_temperature(tables),
         status=(status,) * 3,
@@ -134,7 +142,7 @@ def _judged(
     return StageResult(result, status, code, reason, measured)
 
 
-def calibrate_accelerometer_gated(tables: Tables, s: Settings) -> StageResult:
+def calibrate_accelerometer_gated(tables: Tables, s: GatedAccelerometerSettings) -> StageResult:
     """samples, first-pass constants and rates → calibration: second pass, lever arm taken out (Eq. 3), quiet samples
     only.
 
@@ -142,16 +150,16 @@ def calibrate_accelerometer_gated(tables: Tables, s: Settings) -> StageResult:
     (norm near g, slow rotation) then applies if enough of the sphere remains behind it."""
     samples = tables["samples"]
     own = constants(tables["accelerometer"], "accelerometer") if "accelerometer" in tables else None
-    known = own or logged_constants(s, "accelerometer")
+    known = own or logged_constants(s, Sensor.ACCELEROMETER)
     if known is None or samples["gyroscope_x"].null_count() or samples["accelerometer_x"].null_count():
         # Nothing to gate with: the first pass again, under the limits that count.
-        used = _used_readings(tables, "accelerometer")
-        return _ellipsoid_stage("accelerometer", tables, s, s["gravity_mps2"], "m/s^2", used)
-    gyro = logged_constants(s, "gyroscope")
+        used = _used_readings(tables, Sensor.ACCELEROMETER)
+        return _ellipsoid_stage(Sensor.ACCELEROMETER, tables, s, s.gravity_mps2, "m/s^2", used)
+    gyro = logged_constants(s, Sensor.GYROSCOPE)
     if gyro is None and "gyroscope" in tables:
         gyro = constants(tables["gyroscope"], "gyroscope", refused_too=True)
     logged, smoothed = matrix(samples, triad("accelerometer")), matrix(samples, triad("accelerometer", "smoothed_"))
-    measured: dict[str, Any] = {"lever_arm_applied": s["lever_arm_m"] is not None and gyro is not None}
+    measured: dict[str, Any] = {"lever_arm_applied": s.lever_arm_m is not None and gyro is not None}
     if gyro is None:
         # Rates in counts: at rest, the one thing that can be told without a scale.
         level, noise = motion_selection.windowed_rate(
@@ -159,23 +167,23 @@ def calibrate_accelerometer_gated(tables: Tables, s: Settings) -> StageResult:
         )
         slow = level < 4.0 * noise
     else:
-        axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+        axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
         rate = sensor_model.calibrate(matrix(samples, triad("gyroscope", "smoothed_")), *gyro) @ axes.T
-        slow = np.linalg.norm(rate, axis=1) < s["gate_rate_radps"]
-        if s["lever_arm_m"] is not None:
-            arm = _lever_arm(samples, rate, s)
+        slow = np.linalg.norm(rate, axis=1) < s.gate_rate_radps
+        if s.lever_arm_m is not None:
+            arm = _lever_arm(samples, rate, s.lever_arm_m, s.differentiation_window_s)
             logged, smoothed = (
-                sensor_model.to_centre_of_mass(x, known[0], arm, axes, s["gravity_sign"]) for x in (logged, smoothed)
+                sensor_model.to_centre_of_mass(x, known[0], arm, axes, s.gravity_sign) for x in (logged, smoothed)
             )
-    norm = np.linalg.norm(sensor_model.calibrate(smoothed, *known), axis=1) / s["gravity_mps2"]
-    quiet = (np.abs(norm - 1.0) < s["gate_norm"]) & slow
+    norm = np.linalg.norm(sensor_model.calibrate(smoothed, *known), axis=1) / s.gravity_mps2
+    quiet = (np.abs(norm - 1.0) < s.gate_norm) & slow
     other = float(np.sqrt(np.mean((norm - 1.0) ** 2)))
     measured |= {"gate_passed": int(quiet.sum()), "gate_share": float(quiet.mean()), "other_acceleration_rms_g": other}
-    method, polarity = s["ellipsoid"], s["polarity"]["accelerometer"]
+    method, polarity = s.ellipsoid, s.polarity[Sensor.ACCELEROMETER]
     source = logged if method == "robust" else smoothed
     refused: Exception | None = None
     try:
-        fit = ellipsoid.fit_ellipsoid(source, s["gravity_mps2"], method=method, polarity=polarity)
+        fit = ellipsoid.fit_ellipsoid(source, s.gravity_mps2, method=method, polarity=polarity)
     except (UnusableFlight, EstimationError, ValueError) as error:
         fit, refused = None, error
     gated = _gated_fit(source, quiet, s) if other > GATE_FROM_RMS else None
@@ -183,7 +191,7 @@ def calibrate_accelerometer_gated(tables: Tables, s: Settings) -> StageResult:
     chosen = gated if measured["gate_kept"] else fit
     if chosen is None:
         return refusal(refused or ValueError("no fit"), "accelerometer", measured)
-    return _judged("accelerometer", chosen, tables, s, "m/s^2", logged, measured)
+    return _judged(Sensor.ACCELEROMETER, chosen, tables, s, "m/s^2", logged, measured)
 
 
 def _scale_doubt(fit: TriadFit) -> float:
@@ -191,24 +199,24 @@ def _scale_doubt(fit: TriadFit) -> float:
     return float(np.max(np.sqrt(np.diagonal(fit.covariance)[:3]) / np.abs(fit.scale_diagonal)))
 
 
-def _gated_fit(source: Array, quiet: np.ndarray, s: Settings) -> TriadFit | None:
+def _gated_fit(source: Array, quiet: np.ndarray, s: GatedAccelerometerSettings) -> TriadFit | None:
     """Fit of the quiet samples; None where they see too little of the sphere."""
     if quiet.sum() < 100:
         return None
     try:
         fit = ellipsoid.fit_ellipsoid(
-            source[quiet], s["gravity_mps2"], method=s["ellipsoid"], polarity=s["polarity"]["accelerometer"]
+            source[quiet], s.gravity_mps2, method=s.ellipsoid, polarity=s.polarity[Sensor.ACCELEROMETER]
         )
     except (UnusableFlight, EstimationError):
         return None
-    enough = fit.condition < s["ellipsoid_max_condition"]
+    enough = fit.condition < s.ellipsoid_max_condition
     return fit if enough else None
 
 
-def _lever_arm(samples: pl.DataFrame, rate: Array, s: Settings) -> Array:
+def _lever_arm(samples: pl.DataFrame, rate: Array, arm_m: Triple, window_s: float) -> Array:
     """Acceleration of the sensor about the centre of mass, m/s², body axes, from smoothed rates (Eq. 3)."""
-    rate_dot = differentiate_by_segment(samples, rate, s["differentiation_window_s"])
-    return sensor_model.lever_arm_acceleration(rate, rate_dot, s["lever_arm_m"])
+    rate_dot = differentiate_by_segment(samples, rate, window_s)
+    return sensor_model.lever_arm_acceleration(rate, rate_dot, arm_m)
 
 
 def _with_motor_field(rows: pl.DataFrame, share: float, strength: float) -> pl.DataFrame:
@@ -226,7 +234,7 @@ def _with_motor_field(rows: pl.DataFrame, share: float, strength: float) -> pl.D
     return joined.with_columns(sd=(pl.col("sd") ** 2 + could_err**2).sqrt()).select(rows.columns)
 
 
-def judge_vectors(tables: Tables, s: Settings) -> StageResult:
+def judge_vectors(tables: Tables, s: VectorsSettings) -> StageResult:
     """Both vector triads' calibrations and what the attitude and the motors' current say of them → calibration, faults.
 
     A fit by length alone cannot see polarity or axes, so where attitude says that they contradict each other neither
@@ -236,16 +244,16 @@ def judge_vectors(tables: Tables, s: Settings) -> StageResult:
     if "faults" in tables:
         faults = pl.concat([faults, tables["faults"]])
     parts = []
-    for name in ("magnetometer", "accelerometer"):
+    for name in VECTOR_SENSORS:
         if name not in tables:
             continue
         fault = fatal_fault(faults, (name,))
         if fault is not None:
             code = pl.when(pl.col("status") == "ok").then(pl.lit(fault["reason_code"])).otherwise("reason_code")
             parts.append(tables[name].with_columns(status=pl.lit("refused"), reason_code=code))
-        elif name == "magnetometer" and motor_faults and "motor_field" in measured:
+        elif name == Sensor.MAGNETOMETER and motor_faults and "motor_field" in measured:
             share = float(measured["motor_field"]["share"])
-            parts.append(_with_motor_field(tables[name], share, float(np.linalg.norm(s["field_ned"]))))
+            parts.append(_with_motor_field(tables[name], share, float(np.linalg.norm(s.field_ned))))
         else:
             parts.append(tables[name])
     if not parts:

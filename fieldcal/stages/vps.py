@@ -23,9 +23,11 @@ from fieldcal.geometry.rotation import (
     normalise,
     slerp,
 )
+from fieldcal.names import Sensor
 from fieldcal.stages.attitude import logged_constants
-from fieldcal.stages.inputs import Settings, Tables, is_sound
+from fieldcal.stages.inputs import Tables, is_sound
 from fieldcal.stages.results import StageResult
+from fieldcal.stages.settings import LoggedValues, VpsAttitude, VpsClock, VpsSyncSettings
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, constants, matrix, seconds, triad
 
 NED_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # rotation of ENU components to NED
@@ -43,7 +45,7 @@ RATE_COLUMNS = [f"rate_{axis}_radps" for axis in AXES]
 SYNC_NUMBERS = ("lag_s", "lag_mid_s", "lag_sd_s", "skew_ppm", "skew_sd_ppm", "peak", "runner_up")
 
 
-def synchronise_vps(tables: Tables, s: Settings) -> StageResult:
+def synchronise_vps(tables: Tables, s: VpsSyncSettings) -> StageResult:
     """imu, vps, gyroscope constants, attitude → sync, vps_aligned: the VPS on the IMU's clock and in its frames."""
     if "vps" not in tables or tables["vps"].is_empty():
         return StageResult(status="absent", reason_code="no_vps", reason="The log has no VPS.")
@@ -52,13 +54,13 @@ def synchronise_vps(tables: Tables, s: Settings) -> StageResult:
     if np.isnan(logged).any():
         return StageResult(status="refused", reason_code="no_gyroscope", reason="Synchronisation needs a gyroscope.")
     gyro = _gyro_constants(tables, s)
-    axes = sensor_model.frd_from_sensor(s["rotation_body_from_sensor"], s["body"])
+    axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
     rate = (logged - np.median(logged, axis=0) if gyro is None else sensor_model.calibrate(logged, *gyro)) @ axes.T
     origin = int(imu["t_ns"][0])
     t_imu = seconds(imu["t_ns"], origin)
     # Clocks of different epochs: their starts are laid together first, as integers.
     base_ns = int(vps["t_ns"][0]) - origin
-    if abs(base_ns) * 1e-9 <= s["vps_max_lag_s"] + t_imu[-1]:
+    if abs(base_ns) * 1e-9 <= s.vps_max_lag_s + t_imu[-1]:
         base_ns = 0
     t_vps = seconds(vps["t_ns"], origin + base_ns)
     q_vps = vps_attitude(matrix(vps, QUATERNION), s)
@@ -75,9 +77,9 @@ def synchronise_vps(tables: Tables, s: Settings) -> StageResult:
             rate,
             t_vps,
             q_vps,
-            max_lag_s=s["vps_max_lag_s"],
-            min_peak=s["vps_min_peak"],
-            max_gap_s=s["vps_max_gap_s"],
+            max_lag_s=s.vps_max_lag_s,
+            min_peak=s.vps_min_peak,
+            max_gap_s=s.vps_max_gap_s,
         )
     except UnusableFlight as error:
         row = _sync_row(
@@ -109,16 +111,14 @@ def synchronise_vps(tables: Tables, s: Settings) -> StageResult:
 
 
 def _refined(
-    fit: by_rates.SyncFit, tables: Tables, s: Settings, origin: int, t_vps: Array, q_vps: Array
+    fit: by_rates.SyncFit, tables: Tables, s: VpsClock, origin: int, t_vps: Array, q_vps: Array
 ) -> tuple[by_rates.SyncFit, dict[str, Any]]:
     """The clock by a sound magnetometer too, and what that found."""
     table = tables.get("magnetometer_log")
     if table is None or table.is_empty() or not is_sound(tables, "magnetometer"):
         return fit, {"synchronised_by": "gyroscope"}
     logged = matrix(table, triad("magnetometer"))
-    refined, own = refine_by_field(
-        seconds(table["t_ns"], origin), logged, t_vps, q_vps, fit, max_gap_s=s["vps_max_gap_s"]
-    )
+    refined, own = refine_by_field(seconds(table["t_ns"], origin), logged, t_vps, q_vps, fit, max_gap_s=s.vps_max_gap_s)
     if own is None:
         return fit, {"synchronised_by": "gyroscope"}
     return refined, {
@@ -134,7 +134,7 @@ def _sync_row(values: dict[str, Any]) -> pl.DataFrame:
     return pl.DataFrame([row], schema={**dict.fromkeys(SYNC_NUMBERS, pl.Float64), "status": pl.String})
 
 
-def _gyro_constants(tables: Tables, s: Settings) -> tuple[Array, Array] | None:
+def _gyro_constants(tables: Tables, s: LoggedValues) -> tuple[Array, Array] | None:
     """The joint estimate's constants, else output error's, equation error's, what the logged unit says, or None."""
     own = constants(tables["joint"], "gyroscope") if "joint" in tables else None
     if own is not None:
@@ -143,26 +143,26 @@ def _gyro_constants(tables: Tables, s: Settings) -> tuple[Array, Array] | None:
         own = constants(tables["gyroscope"], "gyroscope", method) if "gyroscope" in tables else None
         if own is not None:
             return own
-    return logged_constants(s, "gyroscope")
+    return logged_constants(s, Sensor.GYROSCOPE)
 
 
-def vps_attitude(q: Array, s: Settings) -> Array:
+def vps_attitude(q: Array, s: VpsAttitude) -> Array:
     """Logged VPS attitudes, body to world, in the paper's NED and FRD; unit length, continuous."""
     with np.errstate(invalid="ignore", divide="ignore"):
         q = normalise(q)
-    if s["world"] == "enu":
+    if s.world == "enu":
         q = multiply(NED_ENU, q)
-    if s["body"] == "flu":
+    if s.body == "flu":
         q = multiply(q, FLU_FRD)
     return q
 
 
 def _aligned(
-    t_vps: Array, q_vps: Array, t_imu: Array, rate: Array, tables: Tables, s: Settings, *, calibrated: bool
+    t_vps: Array, q_vps: Array, t_imu: Array, rate: Array, tables: Tables, s: VpsClock, *, calibrated: bool
 ) -> tuple[dict[str, Array], dict[str, Any]]:
     """VPS attitude and rate on a uniform grid at its own rate, IMU clock, both constant rotations put in."""
     interval = float(np.median(np.diff(t_vps)))
-    rates = by_rates.vps_rates(t_vps, q_vps, interval, max_gap_s=s["vps_max_gap_s"])
+    rates = by_rates.vps_rates(t_vps, q_vps, interval, max_gap_s=s.vps_max_gap_s)
     t = rates.t
     inside = rates.valid & (t >= t_imu[0]) & (t <= t_imu[-1])
     t, q, vps_rate = t[inside], slerp(t_vps, continuous(q_vps), t[inside]), rates.rate[inside]

@@ -9,8 +9,10 @@ import numpy as np
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation import warm_up
 from fieldcal.geometry.rotation import Array
-from fieldcal.stages.inputs import Settings, Tables, is_sound
+from fieldcal.names import Sensor
+from fieldcal.stages.inputs import Tables, is_sound
 from fieldcal.stages.results import ZERO_SLOPE, StageResult, zero_slope_rows
+from fieldcal.stages.settings import WarmUpSettings
 from fieldcal.stages.tables import calibration_rows, constants, matrix, seconds, triad
 
 METHOD, PARAMETER = "warm_up", ZERO_SLOPE
@@ -18,7 +20,7 @@ CURVE = "zero_over_temperature"
 """What stands in `measured`: the zero as a cubic of temperature, level left out, an axis a row."""
 
 
-def find_warm_up(tables: Tables, s: Settings) -> StageResult:
+def find_warm_up(tables: Tables, s: WarmUpSettings) -> StageResult:
     """imu, temperature → calibration: slope of the gyroscope's zero, and of the accelerometer's as far as it shows,
     where the IMU rested while it warmed up."""
     imu, temperature = tables["imu"], tables.get("temperature")
@@ -28,15 +30,15 @@ def find_warm_up(tables: Tables, s: Settings) -> StageResult:
     t = seconds(imu["t_ns"], imu["t_ns"][0])
     warm = np.interp(t, seconds(temperature["t_ns"], imu["t_ns"][0]), temperature["temperature_degc"].to_numpy())
     try:
-        found = warm_up.fit_warm_up(t, logged, warm, max_gap_s=s["manoeuvre_max_gap_s"])
+        found = warm_up.fit_warm_up(t, logged, warm, max_gap_s=s.manoeuvre_max_gap_s)
     except UnusableFlight as error:
         return StageResult(
             status="absent", reason_code=error.reason_code, reason=error.sentence, measured=error.measured
         )
-    rows = _rows("gyroscope", found, s)
+    rows = _rows(Sensor.GYROSCOPE, found, s)
     resting = _resting(tables, s, t, logged, warm)
     if resting is not None:
-        rows += _rows("accelerometer", resting, s)
+        rows += _rows(Sensor.ACCELEROMETER, resting, s)
     measured = {"rest_windows": found.n_windows, "span_degc": found.span_degc, "zero": found.zero.tolist()}
     if found.bend is not None and found.bend_covariance is not None:
         measured |= {
@@ -50,18 +52,18 @@ def find_warm_up(tables: Tables, s: Settings) -> StageResult:
     return StageResult({"calibration": calibration_rows(rows)}, measured=measured)
 
 
-def _rows(sensor: str, found: warm_up.WarmUp, s: Settings) -> list[dict[str, Any]]:
+def _rows(sensor: Sensor, found: warm_up.WarmUp, s: WarmUpSettings) -> list[dict[str, Any]]:
     return zero_slope_rows(
         sensor,
         METHOD,
         found.zero_per_degc,
         found.sd,
-        logged_unit=s["units"][sensor],
+        logged_unit=s.units[sensor],
         temperature_degc=found.temperature_degc,
     )
 
 
-def _resting(tables: Tables, s: Settings, t: Array, rate: Array, warm: Array) -> warm_up.WarmUp | None:
+def _resting(tables: Tables, s: WarmUpSettings, t: Array, rate: Array, warm: Array) -> warm_up.WarmUp | None:
     """The accelerometer at rest; None without readings that can be trusted, constants, or such a rest."""
     known = constants(tables["accelerometer"], "accelerometer") if "accelerometer" in tables else None
     if known is None or not is_sound(tables, "accelerometer"):
@@ -72,6 +74,6 @@ def _resting(tables: Tables, s: Settings, t: Array, rate: Array, warm: Array) ->
         return None
     gravity = logged + np.linalg.solve(scale, bias)
     try:
-        return warm_up.fit_resting_accelerometer(t, rate, logged, warm, gravity, max_gap_s=s["manoeuvre_max_gap_s"])
+        return warm_up.fit_resting_accelerometer(t, rate, logged, warm, gravity, max_gap_s=s.manoeuvre_max_gap_s)
     except UnusableFlight:
         return None

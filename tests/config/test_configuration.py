@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from fieldcal.config.configuration import Alerts, Field, load, parse
-from fieldcal.config.parameters import PARAMETERS
+from fieldcal.config.configuration import Alerts, LocalField, load, parse
+from fieldcal.config.parameters import Parameters
 from fieldcal.errors import ConfigurationError
+from fieldcal.names import SENSORS
 
 CONTRACT = """
 [defaults]
@@ -103,7 +104,7 @@ def test_every_key_of_the_contract_is_understood() -> None:
     vehicle = configuration.vehicle("morpheus-1")
     assert vehicle.imu_id == "MAG3-0042"
     assert (vehicle.world, vehicle.body, vehicle.gravity_sign) == ("ned", "frd", "gravity")
-    assert vehicle.field == Field("norm", (1.0, 0.0, 0.0))
+    assert vehicle.field == LocalField(unit="norm", north_east_down=(1.0, 0.0, 0.0))
     assert vehicle.lever_arm_m == (0.05, 0.02, -0.03)
     assert vehicle.polarity["gyroscope"] == (-1, 1, 1)
     assert vehicle.nominal_scale["magnetometer"] == (1.5e-4, 1.5e-4, 1.5e-4)
@@ -125,7 +126,7 @@ def test_a_fleet_of_different_vehicles_loads(tmp_path: Path) -> None:
     path.write_text(FLEET, encoding="utf-8")
     configuration = load(path)
     assert configuration.path == path
-    assert configuration.vehicle("broad-imu-1").field == Field("T", (15.6e-6, 0.0, 41.4e-6))
+    assert configuration.vehicle("broad-imu-1").field == LocalField(unit="T", north_east_down=(15.6e-6, 0.0, 41.4e-6))
     assert configuration.vehicle("counts").units["magnetometer"] == "counts"
     assert configuration.vehicle("samples").csv.rate_hz == 102.4
     assert "t" not in configuration.vehicle("no-time").csv.imu
@@ -139,7 +140,7 @@ def test_without_a_file_the_log_decides() -> None:
     assert vehicle.gravity_mps2 == 9.80665
     assert vehicle.polarity == dict.fromkeys(("magnetometer", "accelerometer", "gyroscope"), (1, 1, 1))
     assert vehicle.units == {}
-    assert vehicle.parameters == {name: parameter.default for name, parameter in PARAMETERS.items()}
+    assert vehicle.parameters == Parameters()
 
 
 def test_vehicles_override_defaults_key_by_key() -> None:
@@ -165,14 +166,14 @@ def test_vehicles_override_defaults_key_by_key() -> None:
     )
     a, b, other = (configuration.vehicle(name) for name in ("a", "b", "other"))
     assert a.units == {"gyroscope": "deg/s", "accelerometer": "counts"}
-    assert a.field == Field("G", (1.0, 0.0, 1.0))
+    assert a.field == LocalField(unit="G", north_east_down=(1.0, 0.0, 1.0))
     assert a.csv.imu == {"t": "stamp", "temperature": "T"}
-    assert a.parameters["attitude"] == "svd"
-    assert a.parameters["smoothing_cutoff_hz"] == 5.0
-    assert a.parameters["ellipsoid"] == "two_step"
-    assert (b.profile, b.parameters["ellipsoid"], b.parameters["attitude"]) == ("paper", "li", "triad")
-    assert other.field == Field("uT", None, 52.5, 13.4, 0.0)
-    assert other.parameters["attitude"] == "triad"
+    assert a.parameters.attitude == "svd"
+    assert a.parameters.smoothing_cutoff_hz == 5.0
+    assert a.parameters.ellipsoid == "two_step"
+    assert (b.profile, b.parameters.ellipsoid, b.parameters.attitude) == ("paper", "li", "triad")
+    assert other.field == LocalField(unit="uT", latitude_deg=52.5, longitude_deg=13.4)
+    assert other.parameters.attitude == "triad"
 
 
 def test_settings_are_plain_json_and_leave_names_out() -> None:
@@ -272,6 +273,6 @@ def test_method_is_one_name_or_one_a_sensor() -> None:
         """,
         None,
     )
-    assert loaded.vehicle("c").method == "joint"
+    assert loaded.vehicle("c").method == dict.fromkeys(SENSORS, "joint")
     assert loaded.vehicle("a").method == {"magnetometer": "serial", "accelerometer": "joint", "gyroscope": "joint"}
-    assert loaded.vehicle("b").method == "serial"
+    assert loaded.vehicle("b").method == dict.fromkeys(SENSORS, "serial")

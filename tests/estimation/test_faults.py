@@ -20,8 +20,9 @@ from fieldcal.estimation.faults import (
     magnetometer_unit,
     sampling_faults,
 )
+from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import signals
-from fieldcal.simulation.experiment import SENSORS, simulate
+from fieldcal.simulation.experiment import simulate
 from fieldcal.stages.pipeline import PUBLISHED, run_flight
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import columns_of, triad

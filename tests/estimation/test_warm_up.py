@@ -13,6 +13,7 @@ from fieldcal.simulation.archive import settings, signals
 from fieldcal.simulation.experiment import SCALE, Experiment, simulate
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import triad_rows
+from fieldcal.stages.settings import WarmUpSettings, taken_from
 from fieldcal.stages.tables import calibration_rows
 from fieldcal.stages.warm_up import find_warm_up
 
@@ -165,7 +166,7 @@ def test_a_simulated_flight_tells_its_slope() -> None:
             vps=False,
             band_limit=False,
         )
-        result = find_warm_up(signals(simulate(experiment)), settings(experiment))
+        result = find_warm_up(signals(simulate(experiment)), taken_from(settings(experiment), WarmUpSettings))
         rows = result.tables["calibration"]
         assert rows["unit"].unique().to_list() == ["counts/degC"]
         errors += list((rows["value"].to_numpy() + np.array(PER_DEGC) / np.array(SCALE["gyroscope"])) / rows["sd"])

@@ -12,9 +12,10 @@ import pytest
 from fieldcal.exports import FORMATS
 from fieldcal.exports.calibration_at import constants_of
 from fieldcal.flows.run import run_night
+from fieldcal.names import SENSORS
 from fieldcal.report import flight_report
 from fieldcal.simulation.archive import write_flights
-from fieldcal.simulation.experiment import SENSORS, Experiment
+from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse import Warehouse
 
 METHODS = ("serial", "joint")

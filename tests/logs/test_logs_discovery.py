@@ -62,7 +62,11 @@ def test_links_out_of_the_archive_and_loops_are_not_followed(archive: Path, tmp_
 
 def test_archives_of_another_shape_are_mapped(archive: Path) -> None:
     touch(archive / "deep" / "x" / "y" / "log.mcap")
-    mapping = [LogsMap("*.mcap", "solo"), LogsMap("b/*/*", "B"), LogsMap("deep/**/*.mcap", session="all")]
+    mapping = [
+        LogsMap(glob="*.mcap", vehicle="solo"),
+        LogsMap(glob="b/*/*", vehicle="B"),
+        LogsMap(glob="deep/**/*.mcap", session="all"),
+    ]
     found = {log.log_uri: (log.vehicle_id, log.session_id) for log in find_logs(archive, mapping)}
     assert found["loose.mcap"] == ("solo", "loose")
     assert found["b/s1/two.mcap"] == ("B", "s1")

@@ -19,6 +19,7 @@ from fieldcal.simulation.archive import settings as simulated_settings
 from fieldcal.simulation.archive import signals
 from fieldcal.simulation.experiment import simulate
 from fieldcal.stages.preparation import find_manoeuvre, smooth
+from fieldcal.stages.settings import ManoeuvreSettings, SmoothingSettings, taken_from
 from fieldcal.stages.tables import matrix, triad
 
 STEP_NS = 5_000_000
@@ -186,8 +187,8 @@ def test_a_magnetometer_that_pauses_is_not_interpolated_across() -> None:
     pause = (t > 8_000_000_000) & (t < 9_500_000_000)
     tables["magnetometer"] = tables["magnetometer"].filter(pl.Series(~pause))
     chosen = simulated_settings(recording.experiment)
-    segments = find_manoeuvre({"imu": tables["imu"]}, chosen).tables["segments"]
-    samples = smooth({**tables, "segments": segments}, chosen).tables["samples"]
+    segments = find_manoeuvre({"imu": tables["imu"]}, taken_from(chosen, ManoeuvreSettings)).tables["segments"]
+    samples = smooth({**tables, "segments": segments}, taken_from(chosen, SmoothingSettings)).tables["samples"]
     kept = samples["t_ns"].to_numpy()
     assert not ((kept > 8_000_000_000) & (kept < 9_500_000_000)).any()
     segment = samples["segment"].to_numpy()

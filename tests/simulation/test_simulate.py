@@ -17,12 +17,12 @@ from fieldcal.config.configuration import load
 from fieldcal.estimation.clock_sync import by_rates
 from fieldcal.geometry.rotation import conjugate, multiply, to_rotation_vector
 from fieldcal.logs import find_logs, read_log
+from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import settings, signals, truth, write_flights
 from fieldcal.simulation.experiment import (
     BIAS,
     NOISE_VARIANCE,
     SCALE,
-    SENSORS,
     TICK_S,
     VPS_VARIANCE,
     Experiment,
@@ -367,7 +367,7 @@ def test_the_archives_configuration_is_that_of_the_simulated_vehicle(tmp_path: P
     assert first.gravity_mps2 == 9.79
     assert first.lever_arm_m == (0.1, 0.0, -0.2)
     assert first.polarity["gyroscope"] == (-1, 1, 1)
-    np.testing.assert_allclose(settings(e)["field_ned"], [np.cos(0.4), 0.0, np.sin(0.4)])
+    np.testing.assert_allclose(settings(e).field_ned, [np.cos(0.4), 0.0, np.sin(0.4)])
     truths = [json.loads(p.read_text()) for p in sorted(tmp_path.rglob("*.truth.json"))]
     assert len({t["seed"] for t in truths}) == 8
     scales = np.array([t["constants"]["gyroscope"]["scale"] for t in truths])

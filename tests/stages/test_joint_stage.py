@@ -8,8 +8,9 @@ import numpy as np
 import polars as pl
 import pytest
 
+from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import settings, signals, truth
-from fieldcal.simulation.experiment import SENSORS, Recording, simulate
+from fieldcal.simulation.experiment import Recording, simulate
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
 

@@ -28,6 +28,7 @@ from fieldcal.simulation.archive import settings, signals, truth, write_flights
 from fieldcal.simulation.experiment import Experiment, Recording, simulate
 from fieldcal.stages.pipeline import PIPELINE, run_flight
 from fieldcal.stages.results import StageResult
+from fieldcal.stages.settings import as_json, from_json, taken_from
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, matrix, triad
 from fieldcal.stages.vps import FLU_FRD, NED_ENU
 
@@ -69,7 +70,7 @@ def test_without_noise_the_files_give_the_constants_back(tmp_path: Path, log_for
     vehicle = load(tmp_path / "fieldcal.toml").vehicle(log.vehicle_id)
     read, summary = read_log(log.path, vehicle)
     chosen = flight_settings(vehicle, units=summary.units, world=summary.world, body=summary.body)
-    results = run_flight(read, chosen | {"smoothing_cutoff_hz": 0.0})
+    results = run_flight(read, chosen.changed(smoothing_cutoff_hz=0.0))
     known = json.loads((log.path.parent / "flight-01.truth.json").read_text())
     for sensor, tolerance in zip(SENSORS, (VECTOR_EXACT, VECTOR_EXACT, GYRO_EXACT), strict=True):
         for parameter in ("scale", "bias", "zero"):
@@ -180,7 +181,7 @@ def test_the_wrong_gravity_sign_is_told() -> None:
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_a_wrong_polarity_never_gives_a_wrong_gyroscope(flight: Recording, sensor: str, axis: int) -> None:
-    polarity = settings(flight.experiment)["polarity"]
+    polarity = settings(flight.experiment).polarity
     polarity = {**polarity, sensor: [-p if i == axis else p for i, p in enumerate(polarity[sensor])]}
     results = run(flight, polarity=polarity)
     found, true = values(results, "gyroscope"), np.array(truth(flight)["constants"]["gyroscope"]["scale"])
@@ -255,5 +256,6 @@ def test_every_stage_reads_what_an_earlier_one_writes() -> None:
     for stage in PIPELINE:
         assert set(stage.reads.values()) <= known, stage.name
         assert set(stage.needs) <= set(stage.reads), stage.name
-        assert set(stage.settings) <= set(defaults), stage.name
+        takes = taken_from(defaults, stage.takes)
+        assert from_json(json.loads(json.dumps(as_json(takes))), stage.takes) == takes, stage.name
         known |= {f"{stage.name}.{table}" for table in stage.writes}

@@ -14,8 +14,9 @@ from numerics_support import constants, logged, rms
 from scipy.spatial.transform import Rotation
 
 from fieldcal.geometry.rotation import from_euler
+from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import settings, signals
-from fieldcal.simulation.experiment import NOISE_VARIANCE, SENSORS, Experiment, Recording, simulate
+from fieldcal.simulation.experiment import NOISE_VARIANCE, Experiment, Recording, simulate
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import AXES
@@ -58,7 +59,7 @@ def flight(dip_rad: float = 0.0) -> Recording:
 @pytest.mark.parametrize("dip_rad", [0.0, 0.5, 1.1])
 def test_wrong_polarity_never_passes_as_a_wrong_scale(dip_rad: float, sensor: str, axis: int) -> None:
     """One axis of one sensor declared the wrong way round: refused by axis or altogether, or right in spite of it."""
-    polarity = settings(flight(dip_rad).experiment)["polarity"]
+    polarity = settings(flight(dip_rad).experiment).polarity
     wrong = {**polarity, sensor: [-p if i == axis else p for i, p in enumerate(polarity[sensor])]}
     results = run(flight(dip_rad), polarity=wrong)
     errors = relative_errors(results, "gyroscope")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+from fieldcal.config.values import Paths
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.csv.dialect import Dialect
 from fieldcal.logs.csv.units import sensor_unit
@@ -38,7 +38,11 @@ class Columns:
 
 
 def find_columns(
-    dialect: Dialect, configured: Mapping[str, Any], defaults: Mapping[str, tuple[str, ...]], table: str, log_name: str
+    dialect: Dialect,
+    configured: Mapping[str, Paths],
+    defaults: Mapping[str, tuple[str, ...]],
+    table: str,
+    log_name: str,
 ) -> Columns:
     """Positions of the columns of one table ("imu", "vps").
 

@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from fieldcal.config.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.csv import columns as columns_of
 from fieldcal.logs.csv.dialect import cells_of, find_dialect
@@ -17,8 +18,9 @@ from fieldcal.logs.csv.rows import Losses, numbers_of, other_header, read_rows
 from fieldcal.logs.csv.text import LineBlocks
 from fieldcal.logs.csv.time import looks_iso8601, nanoseconds, sample_numbers, sample_times
 from fieldcal.logs.csv.units import time_unit
-from fieldcal.logs.interface import SENSORS, Batch, LogSummary, VehicleLike, logged_units, stamps_are_epoch
+from fieldcal.logs.interface import Batch, LogSummary, logged_units, stamps_are_epoch
 from fieldcal.logs.interface import Columns as BatchColumns
+from fieldcal.names import SENSORS
 
 VPS_COLUMNS = {"quaternion_xyzw": ("qx", "qy", "qz", "qw"), "position": ("px_m", "py_m", "pz_m")}
 POWER_COLUMNS = {"current": ("current_a",), "throttle": ("throttle",)}
@@ -49,17 +51,13 @@ class CsvTable:
         Receives findings and counts.
     """
 
-    def __init__(
-        self, path: Path, name: str, vehicle: VehicleLike, tables: tuple[str, ...], summary: LogSummary
-    ) -> None:
+    def __init__(self, path: Path, name: str, vehicle: Vehicle, tables: tuple[str, ...], summary: LogSummary) -> None:
         self._name = name
         self._summary = summary
         self._csv = vehicle.csv
         self._blocks = LineBlocks(path)
         first = next(iter(self._blocks), b"")
-        self.dialect = find_dialect(
-            first, self._name, getattr(self._csv, "separator", None), getattr(self._csv, "decimal", None)
-        )
+        self.dialect = find_dialect(first, self._name, self._csv.separator, self._csv.decimal)
         self.imu = self._columns("imu", columns_of.IMU_DEFAULTS) if "imu" in tables else None
         self.vps = self._columns("vps", columns_of.VPS_DEFAULTS) if "vps" in tables else None
         if self.vps is not None and "quaternion_xyzw" not in self.vps.values:
@@ -116,7 +114,7 @@ class CsvTable:
         return sorted(wanted)
 
     def _columns(self, table: str, defaults: dict[str, tuple[str, ...]]) -> columns_of.Columns:
-        configured: dict[str, Any] = dict(getattr(self._csv, table, None) or {})
+        configured = self._csv.imu if table == "imu" else self._csv.vps
         return columns_of.find_columns(self.dialect, configured, defaults, table, self._name)
 
     def _cells_of_first_row(self, block: bytes) -> list[str]:
@@ -127,7 +125,7 @@ class CsvTable:
         return []
 
     def _require_time(self, table: columns_of.Columns) -> None:
-        if table.time is None and not getattr(self._csv, "rate_hz", None):
+        if table.time is None and not self._csv.rate_hz:
             raise UnreadableLog(
                 "missing_time",
                 f"{self._name} has no time column among {', '.join(self.dialect.names[:20])}. Name it as csv.imu.t, or "
@@ -138,23 +136,27 @@ class CsvTable:
         """Unit of a time column; None: it holds sample numbers."""
         row = self.dialect.unit_row
         own = time_unit(self.dialect.names[place], row[place] if row else None)
-        configured: str | None = getattr(self._csv, "time_unit", None)
-        if configured or own:
-            return configured or own
+        if self._csv.time_unit or own:
+            return self._csv.time_unit or own
         if place < len(self._first_cells) and looks_iso8601(self._first_cells[place]):
             return "iso8601"
-        return None if getattr(self._csv, "rate_hz", None) else "s"
+        return None if self._csv.rate_hz else "s"
+
+    def _rate_hz(self) -> float:
+        """The configured rate of the rows, which `_require_time` asked for."""
+        assert self._csv.rate_hz is not None
+        return self._csv.rate_hz
 
     def _times(self, frame: pl.DataFrame, place: int | None, places: NDArray[np.int64]) -> tuple[Any, Any]:
         """Nanoseconds of each row, and where they are sound."""
         if place is None:
-            return sample_times(places, self._csv.rate_hz), np.ones(len(places), bool)
+            return sample_times(places, self._rate_hz()), np.ones(len(places), bool)
         unit = self._time_unit(place)
         cells = frame[str(place)]
         times = nanoseconds(cells, unit) if unit else sample_numbers(cells)
         sound = times.is_not_null().to_numpy()
         t_ns = times.fill_null(0).to_numpy()
-        return (t_ns if unit else sample_times(t_ns, self._csv.rate_hz)), sound
+        return (t_ns if unit else sample_times(t_ns, self._rate_hz())), sound
 
     def _block(
         self, frame: pl.DataFrame, numbers: NDArray[np.int64], places: NDArray[np.int64], losses: Losses
@@ -199,7 +201,7 @@ class CsvTable:
         imu = self.imu.values if self.imu is not None else {}
         vps = self.vps.values if self.vps is not None else {}
         inertial = [key for key in ("gyroscope", "accelerometer") if key in imu]
-        axes = {key: tuple(f"{key}_{axis}" for axis in "xyz") for key in SENSORS}
+        axes: dict[str, tuple[str, ...]] = {key: tuple(f"{key}_{axis}" for axis in "xyz") for key in SENSORS}
         return [
             ("imu", [(key, axes[key]) for key in inertial]),
             ("magnetometer", [("magnetometer", axes["magnetometer"])] if "magnetometer" in imu else []),
@@ -244,7 +246,7 @@ class CsvLog:
         `missing_time`, `missing_sensor`; from `batches()` also `ragged_rows`.
     """
 
-    def __init__(self, path: Path, vehicle: VehicleLike) -> None:
+    def __init__(self, path: Path, vehicle: Vehicle) -> None:
         self.summary = LogSummary("csv")
         self._name = path.name
         self._parts = [*self._opened(path, vehicle)]
@@ -271,7 +273,7 @@ class CsvLog:
             told = self.summary.findings[0].sentence if self.summary.findings else "It holds a header only."
             raise UnreadableLog("no_rows", f"{self._name} holds not one usable row. {told}")
 
-    def _opened(self, path: Path, vehicle: VehicleLike) -> Iterator[CsvTable]:
+    def _opened(self, path: Path, vehicle: Vehicle) -> Iterator[CsvTable]:
         if not path.is_dir():
             yield CsvTable(path, path.name, vehicle, ("imu", "vps"), self.summary)
             return

@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldcal.config.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.encodings.decoded import COMPONENTS, Decoded
-from fieldcal.logs.interface import SENSORS, Batch, Columns, LogSummary, VehicleLike, logged_units, stamps_are_epoch
+from fieldcal.logs.interface import Batch, Columns, LogSummary, logged_units, stamps_are_epoch
 from fieldcal.logs.mcap.file import Block, McapFile
 from fieldcal.logs.mcap.records import HEAD_BYTES, MESSAGE_HEAD_BYTES, gather
 from fieldcal.logs.mcap.report import Definitions, report
 from fieldcal.logs.mcap.roles import METADATA_NAME, SI_TYPES, Source, choose_sources
+from fieldcal.names import SENSORS
 
 SI_UNITS = {"gyroscope": "rad/s", "accelerometer": "m/s^2", "magnetometer": "T"}
 CHANNELS_CAP = 4096
@@ -38,11 +40,11 @@ class McapLog:
         `missing_field`, `missing_sensor`, `unsupported_schema`; from `batches()` only `no_messages`.
     """
 
-    def __init__(self, path: Path, vehicle: VehicleLike) -> None:
+    def __init__(self, path: Path, vehicle: Vehicle) -> None:
         self.summary = LogSummary("mcap")
         self._name = path.name
         self._vehicle = vehicle
-        self._by_log_time = getattr(vehicle.mcap, "time", "header") == "log"
+        self._by_log_time = vehicle.mcap.time == "log"
         self._file = McapFile(path)
         definitions = self._file.definitions
         if not self._file.has_summary or not definitions.channels:

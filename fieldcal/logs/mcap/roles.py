@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+from fieldcal.config.configuration import McapMap
+from fieldcal.config.values import Paths
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.encodings.decoded import Decoder, MissingField, UnsupportedSchema, Want
 from fieldcal.logs.encodings.json_messages import JsonDecoder
@@ -72,7 +73,7 @@ class Source:
     values: tuple[str, ...]
 
 
-def choose_sources(definitions: Definitions, mapping: Any, summary: LogSummary, log_name: str) -> list[Source]:
+def choose_sources(definitions: Definitions, mapping: McapMap, summary: LogSummary, log_name: str) -> list[Source]:
     """The sources of every role that the file can fill.
 
     Parameters
@@ -93,9 +94,9 @@ def choose_sources(definitions: Definitions, mapping: Any, summary: LogSummary, 
         has no inertial or magnetic sensor.
     """
     sources = []
-    fields = dict(getattr(mapping, "imu_fields", None) or {})
+    fields = mapping.imu_fields or {}
     for role in KNOWN_TYPES:
-        configured = getattr(mapping, role, None)
+        configured = getattr(mapping, role)
         if configured:
             sources.append(_configured(role, configured, fields, definitions, log_name))
         else:
@@ -111,7 +112,7 @@ def choose_sources(definitions: Definitions, mapping: Any, summary: LogSummary, 
     return sources
 
 
-def _configured(role: str, topic: str, fields: Mapping[str, Any], definitions: Definitions, log_name: str) -> Source:
+def _configured(role: str, topic: str, fields: Mapping[str, Paths], definitions: Definitions, log_name: str) -> Source:
     channels = definitions.by_topic().get(topic)
     if not channels:
         raise UnreadableLog(
@@ -142,7 +143,7 @@ def _configured(role: str, topic: str, fields: Mapping[str, Any], definitions: D
 
 
 def _by_type(
-    role: str, fields: Mapping[str, Any], definitions: Definitions, summary: LogSummary, log_name: str
+    role: str, fields: Mapping[str, Paths], definitions: Definitions, summary: LogSummary, log_name: str
 ) -> Source | None:
     """The source of a role that nothing configures: by message type, then hints in the topic's name, then the name."""
     candidates: dict[str, Source] = {}
@@ -174,7 +175,7 @@ def _by_type(
     return candidates[chosen]
 
 
-def _wants(role: str, type_name: str, fields: Mapping[str, Any]) -> Mapping[str, Want] | None:
+def _wants(role: str, type_name: str, fields: Mapping[str, Paths]) -> Mapping[str, Want] | None:
     known = KNOWN_TYPES[role].get(type_name)
     custom_allowed = not any(type_name in types for types in KNOWN_TYPES.values()) or type_name == RAW_IMU
     if role == "imu" and fields and custom_allowed:

@@ -13,7 +13,8 @@ from fieldcal.estimation.joint import initialise
 from fieldcal.estimation.joint.fit import JointFit, fit_joint
 from fieldcal.estimation.joint.model_selection import add_terms, with_zeros
 from fieldcal.estimation.joint.problem import TERMS, Model, State
-from fieldcal.simulation.experiment import NOISE_VARIANCE, SENSORS, Recording, simulate
+from fieldcal.names import SENSORS
+from fieldcal.simulation.experiment import NOISE_VARIANCE, Recording, simulate
 
 # Axes off by up to 1.7°; the accelerometer's first axis is the body's.
 MIXED = {

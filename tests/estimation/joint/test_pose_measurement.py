@@ -9,8 +9,9 @@ import polars as pl
 import pytest
 from numerics_support import rms
 
+from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import settings, signals
-from fieldcal.simulation.experiment import SENSORS, Recording, constants_at, simulate
+from fieldcal.simulation.experiment import Recording, constants_at, simulate
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import AXES
@@ -69,7 +70,7 @@ def test_without_use_vps_the_vps_changes_nothing() -> None:
     del frames["vps"]
     own = settings(r.experiment, method="joint", lever_arm_m=None)
     for use_vps in (False, True):
-        without = run_flight(frames, own | {"use_vps": use_vps})["joint"].tables["calibration"]
+        without = run_flight(frames, own.changed(use_vps=use_vps))["joint"].tables["calibration"]
         assert with_vps["joint"].tables["calibration"].equals(without)
 
 
