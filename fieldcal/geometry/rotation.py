@@ -9,9 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.floating[Any]]
 
-NED_FROM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-FRD_FROM_FLU = np.diag([1.0, -1.0, -1.0])
-
 
 def skew(v: ArrayLike) -> Array:
     """S(v): the cross-product matrix, (…, 3) → (…, 3, 3); S(v) u = v × u."""

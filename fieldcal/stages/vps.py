@@ -12,6 +12,7 @@ from fieldcal.estimation import smoothing
 from fieldcal.estimation.clock_sync import by_rates
 from fieldcal.estimation.clock_sync.by_field import refine_by_field
 from fieldcal.geometry import sensor_model
+from fieldcal.geometry.frames import FRD_FROM_FLU_QUATERNION, NED_FROM_ENU_QUATERNION
 from fieldcal.geometry.rotation import (
     Array,
     body_from_inertial,
@@ -27,12 +28,6 @@ from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Settings, Tables, is_sound
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, constants, matrix, seconds, triad
-
-NED_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # rotation of ENU components to NED
-
-
-FLU_FRD = np.array([1.0, 0.0, 0.0, 0.0])
-
 
 BRIDGE_S = 0.1  # IMU results are interpolated to VPS stamps only between samples this close
 
@@ -151,9 +146,9 @@ def vps_attitude(q: Array, s: Settings) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         q = normalise(q)
     if s["world"] == "enu":
-        q = multiply(NED_ENU, q)
+        q = multiply(NED_FROM_ENU_QUATERNION, q)
     if s["body"] == "flu":
-        q = multiply(q, FLU_FRD)
+        q = multiply(q, FRD_FROM_FLU_QUATERNION)
     return q
 
 
