@@ -11,9 +11,12 @@ from fieldcal.errors import UnusableFlight
 from fieldcal.estimation import smoothing
 from fieldcal.estimation.clock_sync import by_rates
 from fieldcal.estimation.clock_sync.by_field import refine_by_field
+from fieldcal.estimation.wahba import rotation_between
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.frames import FRD_FROM_FLU_QUATERNION, NED_FROM_ENU_QUATERNION
+from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import (
+    IDENTITY,
     Array,
     body_from_inertial,
     conjugate,
@@ -164,14 +167,14 @@ def _aligned(
     own_rate = smoothing.low_pass(
         np.column_stack([np.interp(t, t_imu, c) for c in rate.T]), by_rates.FINE_CUTOFF_HZ, interval
     )
-    body = np.array([0.0, 0.0, 0.0, 1.0])
+    body = IDENTITY
     if calibrated:
         smooth = smoothing.low_pass(vps_rate, by_rates.FINE_CUTOFF_HZ, interval)
         # ω_body = R ω_vps: components turn by A(body) = R, the attitude by the same quaternion on the right.
-        body = from_matrix(by_rates.rotation_between(smooth, own_rate))
+        body = from_matrix(rotation_between(smooth, own_rate))
     q = multiply(q, body)
     vps_rate = sensor_rotation(vps_rate, body)
-    world = np.array([0.0, 0.0, 0.0, 1.0])
+    world = IDENTITY
     attitude = tables.get("attitude")
     if "trajectory" in tables:
         attitude = tables["trajectory"].with_columns(weight=pl.lit(1.0))
@@ -202,7 +205,5 @@ def interpolate_attitude(t: Array, q: Array, at: Array) -> tuple[Array, np.ndarr
 
 def bridged(t: Array, at: Array) -> np.ndarray:
     """Which times `at` lie between neighbouring stamps t no more than 0.1 s apart, (m,) bool."""
-    i = np.searchsorted(t, at, side="right") - 1
-    ok = (i >= 0) & (i < len(t) - 1)
-    i = np.clip(i, 0, len(t) - 2)
-    return ok & (t[i + 1] - t[i] <= BRIDGE_S)
+    i = interval_of(t, at)
+    return (t[0] <= at) & (at < t[-1]) & (t[i + 1] - t[i] <= BRIDGE_S)
