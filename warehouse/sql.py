@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from fieldcal.schemas import HISTORY_TABLES
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.layout import history_files, vehicle_of
 from fieldcal.warehouse.store import frame
+from fieldcal.warehouse.view_text import view_text
 
 # In the order in which they are made: later ones may need earlier ones.
 VIEWS = ("latest_calibration", "history", "drift_by_temperature", "worst_tic", "refusals", "calibration_at")
@@ -62,9 +62,7 @@ def run_sql(
         `sql_refused` (not one SELECT, or it reaches outside), `sql_wrong` (syntax, unknown names, wrong types),
         `sql_timeout`, `sql_too_large`.
     """
-    texts = {
-        view: (files("fieldcal.warehouse") / "views" / f"{view}.sql").read_text(encoding="utf-8") for view in VIEWS
-    }
+    texts = {view: view_text(view) for view in VIEWS}
     with _sentences(timeout_s, memory_mb):
         try:
             return _answer(root, query, parameters, _named(query, texts), timeout_s, memory_mb, max_result_mb)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fieldcal.estimation.segments import run_starts
 from fieldcal.geometry.rotation import Array
 
 AXES = "xyz"
@@ -115,7 +116,7 @@ def _dead(sensor: str, axis: str, x: Array, unit: str) -> Fault | None:
 
 def _stuck(sensor: str, axis: str, t: Array, x: Array, unit: str) -> Fault | None:
     """A value that is held for far longer than the channel holds values otherwise."""
-    start = np.flatnonzero(np.r_[True, x[1:] != x[:-1]])
+    start = run_starts(x)
     end = np.r_[start[1:], len(x)] - 1
     held = t[end] - t[start]
     usual = float(np.quantile(np.sort(held)[: max(1, len(held) - TEN_SAMPLES)], 0.99))
@@ -242,6 +243,6 @@ def _windowed_rates(t: Array) -> NDArray[np.float64]:
     """Median rate, Hz, in each window of RATE_WINDOW_S with ten samples or more."""
     window = np.floor((t[1:] - t[0]) / RATE_WINDOW_S).astype(np.int64)
     step = np.diff(t)
-    start = np.flatnonzero(np.r_[True, window[1:] != window[:-1]])
+    start = run_starts(window)
     pieces = [piece for piece in np.split(step, start[1:]) if len(piece) >= TEN_SAMPLES]
     return np.array([1.0 / np.median(piece) for piece in pieces])

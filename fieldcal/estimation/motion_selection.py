@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.statistics import MAD_TO_SIGMA
 from fieldcal.geometry.rotation import Array
 
@@ -137,9 +138,8 @@ def _near(t: Array, mark: np.ndarray, distance_s: float) -> np.ndarray:
 
 def _cut(level: Array, used: np.ndarray, a: int, b: int, threshold: float) -> list[Segment]:
     """One contiguous stretch [a, b) as alternating used and unused segments; `used` (b − a,) bool."""
-    edges = np.r_[0, np.flatnonzero(used[1:] != used[:-1]) + 1, b - a]
     out = []
-    for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+    for low, high in run_bounds(used):
         rms = float(np.sqrt(np.mean(level[a + low : a + high] ** 2)))
         keep = bool(used[low]) and high - low >= 10
         why = "rotating, or at rest beside it" if keep else f"quiet: rotation below {threshold:.3g}"

@@ -12,6 +12,7 @@ import numpy as np
 from fieldcal.estimation.gyroscope.equation_error import GyroFit, from_centred
 from fieldcal.estimation.gyroscope.output_error import attitude_error, attitude_sensitivity, shooting_segments
 from fieldcal.estimation.gyroscope.output_error import without_stretch_means as project
+from fieldcal.estimation.segments import begins_run
 from fieldcal.estimation.wahba import attitude_covariance
 from fieldcal.geometry.rotation import Array, body_from_inertial, skew
 
@@ -63,7 +64,7 @@ def constants_to_gyro(
     thin = slice(None, None, max(1, len(t) // MOST_SAMPLES))
     t, q, segment, rate_logged, weight = t[thin], q[thin], segment[thin], rate_logged[thin], weight[thin]
     stretch = shooting_segments(t, segment, stretch_s)
-    first = np.r_[True, stretch[1:] != stretch[:-1]]
+    first = begins_run(stretch)
     centre = rate_logged.mean(axis=0)
     spread = rate_logged.std(axis=0)
     x = (rate_logged - centre) / spread

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fieldcal.geometry.rotation import Array, continuous, from_euler
+from fieldcal.geometry.rotation import Array, continuous, from_euler, parallel_to_quaternion
 
 NEWTON_STEPS = 6
 CHUNK = 4096  # samples worked on at a time: what the processor's cache holds
@@ -225,10 +225,21 @@ def davenport(b: Array, r: Array, weights: Array) -> Array:
 
 def svd(b: Array, r: Array, weights: Array) -> Array:
     """Markley's SVD solution of Wahba's problem."""
-    u, _, vt = np.linalg.svd(np.einsum("k,nki,kj->nij", weights, b, r))
-    middle = np.ones((len(b), 3))
-    middle[:, 2] = np.linalg.det(u) * np.linalg.det(vt)
-    return _from_matrices((u * middle[:, None, :]) @ vt)
+    return _from_matrices(nearest_rotation(np.einsum("k,nki,kj->nij", weights, b, r)))
+
+
+def nearest_rotation(profile: ArrayLike) -> Array:
+    """The rotation A (…, 3, 3) with the largest tr(A Bᵀ) for attitude profiles B = Σ w b rᵀ (…, 3, 3): b ≈ A r
+    (Markley 1988)."""
+    u, _, vt = np.linalg.svd(np.asarray(profile, dtype=float))
+    signs = np.ones(u.shape[:-1])
+    signs[..., 2] = np.linalg.det(u) * np.linalg.det(vt)
+    return np.asarray((u * signs[..., None, :]) @ vt)
+
+
+def rotation_between(a: ArrayLike, b: ArrayLike) -> Array:
+    """The rotation R (3, 3) with b ≈ R a for vectors a, b (n, 3) of any length, each as heavy as it is long."""
+    return nearest_rotation(np.asarray(b, dtype=float).T @ np.asarray(a, dtype=float))
 
 
 def triad(b: Array, r: Array, weights: Array) -> Array:
@@ -244,16 +255,8 @@ def triad(b: Array, r: Array, weights: Array) -> Array:
 
 
 def _from_matrices(a: Array) -> Array:
-    """Quaternions of many A (n, 3, 3), by the largest of the four diagonal candidates."""
-    diagonal = np.stack([a[:, 0, 0], a[:, 1, 1], a[:, 2, 2], np.trace(a, axis1=1, axis2=2)], axis=1)
-    outer = np.empty((len(a), 4, 4))  # 4 q qᵀ
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        outer[:, i, i] = 1 + diagonal[:, i] - diagonal[:, j] - diagonal[:, k]
-        outer[:, i, j] = outer[:, j, i] = a[:, i, j] + a[:, j, i]
-        outer[:, i, 3] = outer[:, 3, i] = a[:, j, k] - a[:, k, j]
-    outer[:, 3, 3] = 1 + diagonal[:, 3]
-    q = outer[np.arange(len(a)), np.argmax(diagonal, axis=1)]
+    """Quaternions (n, 4) of A (n, 3, 3)."""
+    q = parallel_to_quaternion(a)
     return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
 
 

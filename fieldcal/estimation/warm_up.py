@@ -9,17 +9,17 @@ far as gravity is along the axis.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.motion_selection import contiguous
+from fieldcal.estimation.robust import reweighted_rounds
 from fieldcal.estimation.statistics import (
     huber_inflation,
-    huber_weights,
     least_squares_covariance,
-    robust_sigma,
     white_noise_sigma,
 )
 from fieldcal.geometry.rotation import Array
@@ -205,16 +205,20 @@ def _longest_run(middles: Array) -> slice:
 
 def _robust(x: Array, y: Array) -> tuple[Array, Array]:
     """Huber's regression and its covariance."""
-    weight: Array = np.ones(len(y))
-    beta: Array = np.zeros(x.shape[1])
-    for _ in range(ITERATIONS):
+
+    def solve(weight: Array) -> tuple[tuple[Array, Array], Array]:
         root = np.sqrt(weight)
-        new = np.linalg.lstsq(x * root[:, None], y * root, rcond=None)[0]
-        residual = y - x @ new
-        weight = huber_weights(residual, robust_sigma(residual))
+        beta = np.linalg.lstsq(x * root[:, None], y * root, rcond=None)[0]
+        residual = y - x @ beta
+        return (beta, residual), residual
+
+    beta: Array = np.zeros(x.shape[1])
+    for last in islice(reweighted_rounds(solve, len(y)), ITERATIONS):
+        new = last[0][0]
         if np.allclose(new, beta, rtol=1e-12, atol=0.0):
             break
         beta = new
+    (_, residual), weight = last
     root = np.sqrt(weight)[:, None]
     _, covariance = least_squares_covariance((x * root)[:, None, :], residual[:, None] * root)
     return beta, huber_inflation(weight) * covariance

@@ -16,7 +16,8 @@ from fieldcal.exports.calibration import Constants, Triad
 from fieldcal.exports.calibration_at import constants_of
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.earth_field import UNIT_IN_TESLA
-from fieldcal.geometry.rotation import FRD_FROM_FLU, Array
+from fieldcal.geometry.frames import FRD_FROM_FLU
+from fieldcal.geometry.rotation import Array
 from fieldcal.logs import ingest
 from fieldcal.logs.mcap.write import imu_channel, magnetic_field_channel, temperature_channel, write_mcap
 from fieldcal.names import INERTIAL_FIRST, Sensor

@@ -11,10 +11,10 @@ import polars as pl
 from fieldcal.errors import FieldcalError
 from fieldcal.exports.calibration import Constants, Triad, cubic_about
 from fieldcal.names import INERTIAL_FIRST
+from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.stages.tables import AXES
 from fieldcal.warehouse.questions import existing
 
-REFERENCE_DEGC = 25.0
 _QUESTION = """
 SELECT a.*, l.slope_per_degc, l.curve_per_degc2, l.curve_per_degc3, l.temperature_min_degc, l.temperature_max_degc
 FROM calibration_at(?) AS a

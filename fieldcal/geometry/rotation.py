@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fieldcal.geometry.intervals import interval_of, share_of_interval
+
 Array = NDArray[np.floating[Any]]
 
-NED_FROM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-FRD_FROM_FLU = np.diag([1.0, -1.0, -1.0])
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+"""The quaternion of no rotation."""
+IDENTITY.flags.writeable = False
 
 
 def skew(v: ArrayLike) -> Array:
@@ -84,20 +87,28 @@ def body_from_inertial(q: ArrayLike) -> Array:
     return a
 
 
-def from_matrix(a: ArrayLike) -> Array:
-    """Quaternion of one A (3, 3), inertial to body (Shepperd's choice of the largest component)."""
+def parallel_to_quaternion(a: ArrayLike) -> Array:
+    """Vectors (…, 4) along the quaternions of A (…, 3, 3), inertial to body, largest component positive; not of unit
+    length.
+
+    Of 4qqᵀ, whose elements are sums of A's, the row with the largest diagonal element (Shepperd 1978): it never
+    vanishes, at any attitude."""
     a = np.asarray(a, dtype=float)
-    k = np.array([a[0, 0], a[1, 1], a[2, 2], np.trace(a)])
-    i = int(np.argmax(k))
-    q = np.empty(4)
-    if i == 3:
-        q[:] = a[1, 2] - a[2, 1], a[2, 0] - a[0, 2], a[0, 1] - a[1, 0], 1 + k[3]
-    else:
-        j, m = (i + 1) % 3, (i + 2) % 3
-        q[i] = 1 + k[i] - k[j] - k[m]
-        q[j] = a[i, j] + a[j, i]
-        q[m] = a[i, m] + a[m, i]
-        q[3] = a[j, m] - a[m, j]
+    diagonal = np.stack([a[..., 0, 0], a[..., 1, 1], a[..., 2, 2], np.trace(a, axis1=-2, axis2=-1)], axis=-1)
+    outer = np.empty((*a.shape[:-2], 4, 4))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        outer[..., i, i] = 1 + diagonal[..., i] - diagonal[..., j] - diagonal[..., k]
+        outer[..., i, j] = outer[..., j, i] = a[..., i, j] + a[..., j, i]
+        outer[..., i, 3] = outer[..., 3, i] = a[..., j, k] - a[..., k, j]
+    outer[..., 3, 3] = 1 + diagonal[..., 3]
+    largest = np.argmax(diagonal, axis=-1)[..., None, None]
+    return np.asarray(np.take_along_axis(outer, largest, axis=-2)[..., 0, :])
+
+
+def from_matrix(a: ArrayLike) -> Array:
+    """Quaternion (4,) of one A (3, 3), inertial to body, with δ ≥ 0."""
+    q = parallel_to_quaternion(a)
     q /= np.linalg.norm(q)
     return q if q[3] >= 0 else -q
 
@@ -168,7 +179,7 @@ def cumulative_product(steps: ArrayLike) -> Array:
     for k in range(1, length):
         padded[k] = multiply(padded[k - 1], padded[k])
     start = np.empty((blocks, 4))
-    start[0] = 0.0, 0.0, 0.0, 1.0
+    start[0] = IDENTITY
     for k in range(1, blocks):
         start[k] = multiply(start[k - 1], padded[-1, k - 1])
     return normalise(multiply(start, padded).transpose(1, 0, 2).reshape(-1, 4)[:n])
@@ -189,9 +200,9 @@ def hermite(t: ArrayLike, q: ArrayLike, rate: ArrayLike, at: ArrayLike) -> Array
     Between samples T apart SLERP cuts a swing of ω rad/s short by (ωT)²/12: 0.3 % at 3 Hz and 10 ms. Samples without a
     rate (NaN) fall back on it."""
     t, q, rate, at = (np.asarray(x, dtype=float) for x in (t, q, rate, at))
-    i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    i = interval_of(t, at)
     step = t[i + 1] - t[i]
-    u = np.clip((at - t[i]) / step, 0.0, 1.0)[:, None]
+    u = share_of_interval(t, i, at)[:, None]
     whole = to_rotation_vector(multiply(conjugate(q[i]), q[i + 1]))
     begin, end = rate[i] * step[:, None], rate[i + 1] * step[:, None]
     begin, end = (np.where(np.isfinite(x), x, whole) for x in (begin, end))
@@ -204,10 +215,9 @@ def slerp(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:
 
     Times outside t take the nearest end; mask them. Does not look for gaps: mask those too."""
     t, q, at = np.asarray(t, dtype=float), np.asarray(q, dtype=float), np.asarray(at, dtype=float)
-    i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    fraction = np.clip((at - t[i]) / (t[i + 1] - t[i]), 0.0, 1.0)
+    i = interval_of(t, at)
     step = to_rotation_vector(multiply(conjugate(q[i]), q[i + 1]))
-    return continuous(multiply(q[i], from_rotation_vector(fraction[:, None] * step)))
+    return continuous(multiply(q[i], from_rotation_vector(share_of_interval(t, i, at)[:, None] * step)))
 
 
 def euler_angles(q: ArrayLike) -> Array:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fieldcal.geometry.rotation import FRD_FROM_FLU, Array
+from fieldcal.geometry.frames import FRD_FROM_FLU
+from fieldcal.geometry.rotation import Array
 
 GRAVITY_SIGNS = {"gravity": 1.0, "specific_force": -1.0}
 

@@ -12,6 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldcal.estimation.segments import run_starts
+from fieldcal.geometry.intervals import interval_of
+
 Stamps = NDArray[np.int64]
 
 COUNTER_PERIODS_NS = (2**32 * 1000, 2**32 * 1_000_000)
@@ -141,8 +144,8 @@ def _set_back(t_ns: Stamps, run: Stamps) -> tuple[Stamps, int]:
     """Runs before which the clock was set back, and the longest overlap, from stamps (n,) in runs of recording."""
     order = np.argsort(t_ns, kind="stable")
     label = run[order]
-    switch = np.flatnonzero(label[1:] != label[:-1])
-    pair = np.sort(np.stack([label[switch], label[switch + 1]]), axis=0)
+    switch = run_starts(label)[1:]
+    pair = np.sort(np.stack([label[switch - 1], label[switch]]), axis=0)
     pairs, counts = np.unique(pair, axis=1, return_counts=True)
     pairs = pairs[:, counts >= INTERLEAVED]
     if not pairs.size:
@@ -166,9 +169,9 @@ def _wild(t_ns: Stamps, stray: NDArray[np.bool_]) -> NDArray[np.bool_]:
     others = np.sort(t_ns[~wild])
     interval = float(np.median(np.diff(others)))
     t = t_ns[wild]
-    right = np.clip(np.searchsorted(others, t), 1, len(others) - 1)
+    i = interval_of(others, t, on_stamp="ends")
     inside = (others[0] < t) & (t < others[-1])
-    hole = others[right] - others[right - 1] >= HOLE * interval
+    hole = others[i + 1] - others[i] >= HOLE * interval
     beyond = np.maximum(others[0] - t, t - others[-1])
     wild[wild] = np.where(inside, ~hole, beyond > NEAR_NS)
     return wild

@@ -11,6 +11,7 @@ import numpy as np
 import polars as pl
 
 from fieldcal.errors import UnreadableLog
+from fieldcal.estimation.segments import begins_run
 from fieldcal.logs import SIGNAL_COLUMNS, Columns, Finding, batch_frame, stamps
 
 SENSOR_TABLES = ("imu", "magnetometer", "vps")
@@ -134,7 +135,7 @@ class TidySignal:
     def _copies(self, frame: pl.DataFrame) -> tuple[np.ndarray, np.ndarray]:
         """Of sorted rows: which are the first of their stamp, and which of the others repeat it in every value."""
         t = frame["t_ns"].to_numpy()
-        first = np.r_[True, t[1:] != t[:-1]]
+        first = begins_run(t)
         copy = np.zeros(len(t), dtype=bool)
         if not first.all():
             leaders = np.flatnonzero(first)[np.cumsum(first) - 1]

@@ -10,6 +10,7 @@ import polars as pl
 
 from fieldcal.estimation.gyroscope.equation_error import predicted_quaternion_rate
 from fieldcal.estimation.gyroscope.output_error import propagate_stretches, start_stretches
+from fieldcal.estimation.segments import begins_run, run_bounds
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, conjugate, continuous, multiply, to_rotation_vector
 from fieldcal.report.flight_data import FigureSettings
@@ -131,10 +132,9 @@ def amplitude_spectrum(t: Array, x: Array, segment: np.ndarray) -> tuple[Array, 
     the longest stretch without a gap; None where that is under 2 s."""
     from scipy.signal import welch
 
-    cuts = np.flatnonzero((np.diff(segment) != 0) | (np.diff(t) > 0.1)) + 1
-    starts, ends = np.r_[0, cuts], np.r_[cuts, len(t)]
-    longest = int(np.argmax(ends - starts))
-    a, b = int(starts[longest]), int(ends[longest])
+    begins = begins_run(segment)
+    begins[1:] |= np.diff(t) > 0.1
+    a, b = max(run_bounds(np.cumsum(begins)), key=lambda bounds: bounds[1] - bounds[0])
     if b - a < 16 or t[b - 1] - t[a] < 2.0:
         return None
     rate = 1.0 / float(np.median(np.diff(t[a:b])))

@@ -11,11 +11,11 @@ import polars as pl
 
 from fieldcal.geometry.rotation import Array
 from fieldcal.report.words import count, day, scientific, with_unit
+from fieldcal.schemas.reference import REFERENCE_DEGC
 
 STATUSES = ("step", "drifting", "outlier", "stable", "insufficient")
 """Worst first; `insufficient` says nothing, so a vehicle has it only where nothing else is known."""
 
-REFERENCE_DEGC = 25.0
 DAY_S = 86400.0
 
 
@@ -32,7 +32,7 @@ def change_sentence(row: Mapping[str, Any], siblings: Sequence[float]) -> str:
     told = str(row["reason"] or "")
     if row["status"] == "outlier" and siblings:
         median = with_unit(scientific(float(np.median(siblings))), row["unit"])
-        told = f"{told} Median of {count(len(siblings), 'sibling')} at 25 °C: {median}.".strip()
+        told = f"{told} Median of {count(len(siblings), 'sibling')} at {REFERENCE_DEGC:g} °C: {median}.".strip()
     if told:
         return told
     if row["change_at"] is not None:

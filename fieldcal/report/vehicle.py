@@ -17,6 +17,7 @@ from fieldcal.report.page import Column, Folded, Heading, Notice, Page, Part, Se
 from fieldcal.report.trend import STATUSES, change_sentence, fly_with_sentence, worst_status
 from fieldcal.report.vehicle_figures import MOST_POINTS, agreement_plot, lag_plot, parameter_plot
 from fieldcal.report.words import PARAMETERS, age, count, day, plain_name, preferred, scientific, unit
+from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.stages.warm_up import METHOD as WARM_UP
 from fieldcal.stages.warm_up import PARAMETER as WARM_UP_SLOPE
 from fieldcal.warehouse import Warehouse
@@ -103,7 +104,11 @@ def _fly_with(warehouse: Warehouse, imu_id: str) -> list[Part]:
     ]
     return [
         Text("z = scale · logged + bias, sensor axes. A constant of one flight holds at its temperature."),
-        Table("Latest constants at 25 °C, ± one standard deviation (view latest_calibration)", columns, lines),
+        Table(
+            f"Latest constants at {REFERENCE_DEGC:g} °C, ± one standard deviation (view latest_calibration)",
+            columns,
+            lines,
+        ),
     ]
 
 
@@ -170,7 +175,7 @@ def _trend_table(caption: str, rows: list[dict[str, Any]]) -> Table:
         Column("axis"),
         Column("status"),
         Column("flights", "n"),
-        Column("at 25 °C", "n"),
+        Column(f"at {REFERENCE_DEGC:g} °C", "n"),
         Column("per °C", "n"),
         Column("per day", "n"),
         Column("unit"),

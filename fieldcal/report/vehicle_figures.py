@@ -12,8 +12,9 @@ import polars as pl
 from fieldcal.geometry.rotation import Array
 from fieldcal.report.page import Plot
 from fieldcal.report.plot import INK, XYZ, headed, legend_below, panels, svg
-from fieldcal.report.trend import REFERENCE_DEGC, days_after, predicted, warmed
+from fieldcal.report.trend import days_after, predicted, warmed
 from fieldcal.report.words import count, day, unit
+from fieldcal.schemas.reference import REFERENCE_DEGC
 
 MOST_POINTS = 250
 """Flights in a panel; fewer where a page has more panels."""
@@ -24,8 +25,8 @@ _ROW_IN = 1.35
 
 
 TOLD = {
-    "trend": f"Line and band: the regression of table drift ±{SIGMAS:.0f}σ; points against time are reduced to 25 °C,"
-    " those against temperature to the time of the last flight.",
+    "trend": f"Line and band: the regression of table drift ±{SIGMAS:.0f}σ; points against time are reduced to"
+    f" {REFERENCE_DEGC:g} °C, those against temperature to the time of the last flight.",
     "plain": "Values as estimated; table drift has no regression of it.",
     "step": "Dashed vertical line: detected step; grey points lie before it.",
     "refused": "Crosses: refused, not used.",

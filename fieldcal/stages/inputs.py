@@ -9,6 +9,8 @@ import numpy as np
 import polars as pl
 
 from fieldcal.estimation import smoothing
+from fieldcal.estimation.segments import run_bounds
+from fieldcal.estimation.statistics import robust_sigma
 from fieldcal.geometry.rotation import Array
 from fieldcal.geometry.sensor_model import default_reference_reading
 from fieldcal.names import Sensor
@@ -48,15 +50,14 @@ def differentiate_by_segment(samples: pl.DataFrame, x: Array, window_s: float) -
     """Local smoothed derivative of x (n, m) by segment."""
     t_ns, segment = samples["t_ns"].to_numpy(), samples["segment"].to_numpy()
     out = np.empty_like(x)
-    starts = np.flatnonzero(np.r_[True, segment[1:] != segment[:-1]])
-    for a, b in zip(starts, np.r_[starts[1:], len(segment)], strict=True):
+    for a, b in run_bounds(segment):
         out[a:b] = smoothing.differentiate_samples((t_ns[a:b] - t_ns[a]) * 1e-9, x[a:b], window_s=window_s)
     return out
 
 
 def spread_of(excess: Array) -> float:
     """Robust spread of a relative excess length: the direction noise to expect across it. At least 1e-4 rad."""
-    return max(float(1.4826 * np.median(np.abs(excess - np.median(excess)))), 1e-4)
+    return max(robust_sigma(excess - np.median(excess)), 1e-4)
 
 
 def refusal(error: Exception, name: str, measured: Mapping[str, Any] | None = None) -> StageResult:

@@ -15,6 +15,7 @@ from fieldcal.estimation.joint.fit import JointFit, fit_joint
 from fieldcal.estimation.joint.measurement_model import body_jumps
 from fieldcal.estimation.joint.problem import TERMS, Readings
 from fieldcal.geometry import sensor_model
+from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array, from_matrix, multiply
 from fieldcal.names import SENSORS, Approach, Sensor
 from fieldcal.stages.attitude import logged_constants
@@ -127,8 +128,8 @@ def readings_of(tables: Tables, s: JointSettings) -> Readings:
     if magnetometer is not None and len(magnetometer) < SPARSE * len(tables["imu"]):
         own = np.zeros(len(t), dtype=bool)
         at = seconds(magnetometer["t_ns"], samples["t_ns"][0])
-        after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
-        nearest = np.where(at - t[after - 1] < t[after] - at, after - 1, after)
+        before = interval_of(t, at, on_stamp="ends")
+        nearest = np.where(at - t[before] < t[before + 1] - at, before, before + 1)
         own[nearest[np.abs(t[nearest] - at) < 2.0 * float(np.median(np.diff(t)))]] = True
         logged["magnetometer"] = np.where(own[:, None], logged["magnetometer"], np.nan)
     vectors = {name: x for name, x in logged.items() if name != "gyroscope"}

@@ -12,6 +12,7 @@ from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation import ellipsoid, motor_field
 from fieldcal.estimation.faults import Fault
 from fieldcal.geometry import sensor_model
+from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Sensor
 from fieldcal.stages.inputs import Tables, in_used_segments
@@ -83,8 +84,8 @@ def _drive_at(t_ns: np.ndarray, own_ns: np.ndarray, values: Array) -> Array:
     at, known = (t_ns - own_ns[0]) * 1e-9, (own_ns - own_ns[0]) * 1e-9
     result = np.interp(at, known, values, left=np.nan, right=np.nan)
     longest = max(PAUSE_S, PAUSE * float(np.median(np.diff(known))))
-    right = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
-    result[known[right] - known[right - 1] > longest] = np.nan
+    i = interval_of(known, at, on_stamp="ends")
+    result[known[i + 1] - known[i] > longest] = np.nan
     return result
 
 

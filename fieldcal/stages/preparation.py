@@ -8,6 +8,8 @@ import numpy as np
 import polars as pl
 
 from fieldcal.estimation import motion_selection, smoothing
+from fieldcal.estimation.segments import run_bounds
+from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.results import StageResult
@@ -116,8 +118,7 @@ def _whole_stretches(segments: pl.DataFrame, stamps: np.ndarray, logged: Array) 
         if silent.all() or not quiet.any():
             found.append((number, slice(first, last)))
             continue
-        edges = first + np.r_[0, np.flatnonzero(quiet[1:] != quiet[:-1]) + 1, last - first]
-        for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        for a, b in ((first + start, first + stop) for start, stop in run_bounds(quiet)):
             if not silent[a] and b - a >= SHORTEST_STRETCH:
                 found.append((number if not found or found[-1][0] != number else extra, slice(a, b)))
                 extra += 1
@@ -138,9 +139,9 @@ def _magnetometer_at(tables: Tables, stamps: np.ndarray) -> Array:
     at, known = (stamps - origin) * 1e-9, (own - origin) * 1e-9
     result = np.column_stack([np.interp(at, known, column) for column in values.T])
     longest = max(MAGNETOMETER_PAUSE_S, MAGNETOMETER_PAUSE * float(np.median(np.diff(known))))
-    right = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
+    i = interval_of(known, at, on_stamp="ends")
     between = (known[0] <= at) & (at <= known[-1])
-    paused = between & (known[right] - known[right - 1] > longest)
+    paused = between & (known[i + 1] - known[i] > longest)
     beyond = np.maximum(known[0] - at, at - known[-1]) > longest
     result[(paused & ~np.isin(stamps, own)) | beyond] = np.nan
     return result

@@ -11,8 +11,12 @@ from fieldcal.errors import UnusableFlight
 from fieldcal.estimation import smoothing
 from fieldcal.estimation.clock_sync import by_rates
 from fieldcal.estimation.clock_sync.by_field import refine_by_field
+from fieldcal.estimation.wahba import rotation_between
 from fieldcal.geometry import sensor_model
+from fieldcal.geometry.frames import FRD_FROM_FLU_QUATERNION, NED_FROM_ENU_QUATERNION
+from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import (
+    IDENTITY,
     Array,
     body_from_inertial,
     conjugate,
@@ -29,12 +33,6 @@ from fieldcal.stages.inputs import Tables, is_sound
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.settings import LoggedValues, VpsAttitude, VpsClock, VpsSyncSettings
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, constants, matrix, seconds, triad
-
-NED_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # rotation of ENU components to NED
-
-
-FLU_FRD = np.array([1.0, 0.0, 0.0, 0.0])
-
 
 BRIDGE_S = 0.1  # IMU results are interpolated to VPS stamps only between samples this close
 
@@ -151,9 +149,9 @@ def vps_attitude(q: Array, s: VpsAttitude) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         q = normalise(q)
     if s.world == "enu":
-        q = multiply(NED_ENU, q)
+        q = multiply(NED_FROM_ENU_QUATERNION, q)
     if s.body == "flu":
-        q = multiply(q, FLU_FRD)
+        q = multiply(q, FRD_FROM_FLU_QUATERNION)
     return q
 
 
@@ -169,14 +167,14 @@ def _aligned(
     own_rate = smoothing.low_pass(
         np.column_stack([np.interp(t, t_imu, c) for c in rate.T]), by_rates.FINE_CUTOFF_HZ, interval
     )
-    body = np.array([0.0, 0.0, 0.0, 1.0])
+    body = IDENTITY
     if calibrated:
         smooth = smoothing.low_pass(vps_rate, by_rates.FINE_CUTOFF_HZ, interval)
         # ω_body = R ω_vps: components turn by A(body) = R, the attitude by the same quaternion on the right.
-        body = from_matrix(by_rates.rotation_between(smooth, own_rate))
+        body = from_matrix(rotation_between(smooth, own_rate))
     q = multiply(q, body)
     vps_rate = sensor_rotation(vps_rate, body)
-    world = np.array([0.0, 0.0, 0.0, 1.0])
+    world = IDENTITY
     attitude = tables.get("attitude")
     if "trajectory" in tables:
         attitude = tables["trajectory"].with_columns(weight=pl.lit(1.0))
@@ -207,7 +205,5 @@ def interpolate_attitude(t: Array, q: Array, at: Array) -> tuple[Array, np.ndarr
 
 def bridged(t: Array, at: Array) -> np.ndarray:
     """Which times `at` lie between neighbouring stamps t no more than 0.1 s apart, (m,) bool."""
-    i = np.searchsorted(t, at, side="right") - 1
-    ok = (i >= 0) & (i < len(t) - 1)
-    i = np.clip(i, 0, len(t) - 2)
-    return ok & (t[i + 1] - t[i] <= BRIDGE_S)
+    i = interval_of(t, at)
+    return (t[0] <= at) & (at < t[-1]) & (t[i + 1] - t[i] <= BRIDGE_S)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import stdtr
 
+from fieldcal.estimation.segments import begins_run, run_starts
 from fieldcal.estimation.statistics import MAD_TO_SIGMA
 from fieldcal.geometry.rotation import Array
 from fieldcal.trends.random_effects import summed
@@ -47,7 +48,7 @@ def weighted_median(label: np.ndarray, x: Array, weight: Array, size: int) -> Ar
     before = np.concatenate([[0.0], np.cumsum(total)])[label]
     reached = np.cumsum(weight) - before >= 0.5 * total[label] * (1 - 1e-12)
     result = np.zeros(size)
-    first = np.flatnonzero(reached & np.concatenate([[True], (label[1:] != label[:-1]) | ~reached[:-1]]))
+    first = np.flatnonzero(reached & (begins_run(label) | ~np.r_[False, reached[:-1]]))
     result[label[first]] = x[first]
     return result
 
@@ -119,7 +120,7 @@ def strongest_step(
     )
     gain = np.where(possible, zr**2 / np.where(possible, free, 1.0), -1.0)
     order = np.lexsort((-np.arange(n), gain, row))
-    last = np.flatnonzero(np.concatenate([row[order][1:] != row[order][:-1], [True]]))
+    last = np.r_[run_starts(row[order])[1:], n] - 1
     best = order[last]
     best = best[gain[best] > 0.0]
     rows = row[best]

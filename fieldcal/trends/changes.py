@@ -11,7 +11,8 @@ from typing import Any
 import polars as pl
 
 from fieldcal.config.configuration import Alerts
-from fieldcal.trends.reasons import AGREEMENT, UNCONFIRMED_SIGMAS
+from fieldcal.schemas.reference import UNCONFIRMED_SD
+from fieldcal.trends.reasons import AGREEMENT
 from fieldcal.warehouse import Warehouse
 
 NORMAL = Alerts()
@@ -83,7 +84,7 @@ def last_usable(root: Path) -> pl.DataFrame:
 def _news(both: pl.DataFrame) -> Iterable[Change]:
     """Rows whose status became worse or well again, whose step is another, or whose last flight is newly off."""
     status, before = pl.col("status"), pl.col("status_before")
-    off, off_before = (pl.col(name).abs().fill_null(0.0) > UNCONFIRMED_SIGMAS for name in ("last_z", "last_z_before"))
+    off, off_before = (pl.col(name).abs().fill_null(0.0) > UNCONFIRMED_SD for name in ("last_z", "last_z_before"))
     another = (status == "step") & (pl.col("change_at") != pl.col("change_at_before"))
     kind = (
         pl.when(status.is_in(STATUSES) & (status.ne_missing(before) | another.fill_null(False)))

@@ -12,8 +12,8 @@ import polars as pl
 
 from fieldcal.estimation.warm_up import SCALE_PER_DEGC_SD
 from fieldcal.geometry.rotation import Array
+from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.stages.warm_up import CURVE, METHOD, PARAMETER
-from fieldcal.trends.evidence import REFERENCE_DEGC
 from fieldcal.trends.regression import Trends
 from fieldcal.trends.series import Histories
 from fieldcal.trends.temperature_curve import ORDER, Curve, about_reference, combined, of_sessions, together, widening

@@ -10,11 +10,11 @@ import numpy as np
 from scipy import special
 
 from fieldcal.geometry.rotation import Array
+from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.trends.change_points import scatter_variance, strongest_step, temperature_slope
 from fieldcal.trends.random_effects import Grouping, Regression, fit_random_effects
 from fieldcal.trends.series import FLOOR, TEMPERATURE, TIME, Histories, Prepared, largest, prepare
 
-REFERENCE_DEGC = 25.0
 FALSE_ALARMS = 0.01
 """Share of the alarms of one kind (drift, step) that may be false, over all rows (Benjamini and Hochberg)."""
 MOST_STEPS = 3

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fieldcal.estimation.segments import run_starts
 from fieldcal.trends.evidence import TOLD, Evidence, evidence
 from fieldcal.trends.series import Histories
 from fieldcal.warehouse.files import write_bytes
@@ -36,7 +37,7 @@ class Memory:
 
     def of(self, h: Histories, imu: np.ndarray) -> Evidence:
         """Evidence of all histories; `imu` (g,), ascending in runs: equal for the histories of one IMU."""
-        bounds = np.flatnonzero(np.r_[True, imu[1:] != imu[:-1], True])
+        bounds = np.append(run_starts(imu), len(imu))
         starts = np.searchsorted(h.row, bounds)
         blocks = zip(bounds[:-1], bounds[1:], starts[:-1], starts[1:], strict=True)
         return _joined([self._one(_block(h, *block)) for block in blocks])

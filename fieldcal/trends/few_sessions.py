@@ -13,7 +13,7 @@ import numpy as np
 from scipy import stats
 
 from fieldcal.geometry.rotation import Array
-from fieldcal.trends.evidence import REFERENCE_DEGC
+from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.trends.regression import Trends
 from fieldcal.trends.series import ENOUGH_SESSIONS, Histories
 from fieldcal.trends.siblings import ENOUGH_SIBLINGS, REFERENCE_LEVEL, outliers

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fieldcal.estimation.segments import run_starts
 from fieldcal.geometry.rotation import Array
 
 ITERATIONS = 25
@@ -68,8 +69,7 @@ def summed(label: np.ndarray, x: Array, size: int) -> Array:
 
 def _runs(label: np.ndarray, x: Array) -> Array:
     """`summed` where labels ascend and none is left out."""
-    starts = np.flatnonzero(np.concatenate([[True], label[1:] != label[:-1]]))
-    return np.asarray(np.add.reduceat(np.asarray(x, dtype=float), starts, axis=0))
+    return np.asarray(np.add.reduceat(np.asarray(x, dtype=float), run_starts(label), axis=0))
 
 
 def fit_random_effects(

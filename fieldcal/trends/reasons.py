@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from fieldcal.schemas.reference import UNCONFIRMED_SD
 from fieldcal.trends.series import ENOUGH_SESSIONS
 from fieldcal.words.numbers import number, with_sd
 
 VPS, AGREEMENT = "vps", "fit"
 """What stands as `sensor` of rows about the VPS clock and about agreement (Theil's coefficients)."""
-UNCONFIRMED_SIGMAS = 5.0
-"""Distance of the last flight from the line beyond which it may be the first after a step."""
 
 
 def reason(row: Mapping[str, Any]) -> str | None:
@@ -33,7 +32,7 @@ def reason(row: Mapping[str, Any]) -> str | None:
     if row["status"] == "outlier":
         what = "Its scatter between sessions" if row["sensor"] == "vps" else number(row["value_at_25degc"]) + unit
         return f"{what} is {row['fleet_z']:+.1f} sd from the fleet's other IMUs."
-    if row["last_z"] is not None and abs(row["last_z"]) > UNCONFIRMED_SIGMAS:
+    if row["last_z"] is not None and abs(row["last_z"]) > UNCONFIRMED_SD:
         return (
             f"The last flight is {row['last_z']:+.1f} sd off the line: spoiled, or the first after a step. Another"
             " session will tell."

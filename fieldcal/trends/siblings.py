@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import special, stats
 
+from fieldcal.estimation.segments import run_starts
 from fieldcal.geometry.rotation import Array
 
 LEAST_SIBLINGS = 2
@@ -145,7 +146,7 @@ def moderated_variance(group: np.ndarray, variance: Array, freedom: Array) -> tu
 def _groups(label: np.ndarray) -> list[np.ndarray]:
     """Indices of equal labels."""
     order = np.argsort(label, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+    return np.split(order, run_starts(label[order])[1:])
 
 
 def _inverse_trigamma(y: float) -> float:

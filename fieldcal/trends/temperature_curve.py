@@ -14,7 +14,7 @@ import numpy as np
 from scipy import stats
 
 from fieldcal.geometry.rotation import Array
-from fieldcal.trends.evidence import REFERENCE_DEGC
+from fieldcal.schemas.reference import REFERENCE_DEGC
 
 ORDER = 3
 SIGNIFICANT_SIGMAS = 4.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numerics_support import angle, constants, directions, logged, random_attitudes, rms
+from numerics_support import angle, constants, logged, random_attitudes, rms
 from scipy.spatial.transform import Rotation
 
 from fieldcal.errors import UnusableFlight
@@ -311,17 +311,6 @@ def test_imu_gaps_are_masked() -> None:
     found = by_rates.imu_rates(t, np.ones((len(t), 3)), 0.01)
     assert not found.valid[(found.t > 2.0) & (found.t < 2.98)].any()
     assert found.valid[(found.t < 1.98) | (found.t > 3.01)].all()
-
-
-def test_rotation_between_is_scipys() -> None:
-    rng = np.random.default_rng(10)
-    a = directions(rng, 50)
-    true = Rotation.from_quat(random_attitudes(rng, 1)[0])
-    b = true.apply(a) + 0.05 * rng.normal(size=a.shape)
-    np.testing.assert_allclose(by_rates.rotation_between(a, b), Rotation.align_vectors(b, a)[0].as_matrix(), atol=1e-7)
-    np.testing.assert_allclose(
-        by_rates.rotation_between(a, -a) @ by_rates.rotation_between(a, -a).T, np.eye(3), atol=1e-9
-    )
 
 
 def test_both_constant_rotations_are_found() -> None:

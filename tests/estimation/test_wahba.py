@@ -7,7 +7,14 @@ import pytest
 from numerics_support import AXES, MICRODEGREE_RAD, angle, directions, random_attitudes, rms
 from scipy.spatial.transform import Rotation
 
-from fieldcal.estimation.wahba import METHODS, attitude_covariance, attitudes, rotate_reference
+from fieldcal.estimation.wahba import (
+    METHODS,
+    attitude_covariance,
+    attitudes,
+    nearest_rotation,
+    rotate_reference,
+    rotation_between,
+)
 from fieldcal.geometry.rotation import conjugate, from_euler, from_rotation_vector, multiply, to_rotation_vector
 
 DOWN = np.array([0.0, 0.0, 1.0])
@@ -222,3 +229,28 @@ def test_callers_errors() -> None:
             attitudes(*given)
     with pytest.raises(ValueError, match="quest"):
         attitudes(observed, reference, SIGMA[:2], method="flae")
+
+
+def test_rotation_between_is_scipys() -> None:
+    rng = np.random.default_rng(10)
+    a = directions(rng, 50)
+    true = Rotation.from_quat(random_attitudes(rng, 1)[0])
+    b = true.apply(a) + 0.05 * rng.normal(size=a.shape)
+    np.testing.assert_allclose(rotation_between(a, b), Rotation.align_vectors(b, a)[0].as_matrix(), atol=1e-7)
+
+
+def test_rotation_between_never_mirrors() -> None:
+    a = directions(np.random.default_rng(10), 50)
+    found = rotation_between(a, -a)
+    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(found) == pytest.approx(1.0)
+
+
+def test_nearest_rotations_of_a_stack_are_scipys() -> None:
+    rng = np.random.default_rng(11)
+    a, weight = directions(rng, 6), rng.uniform(0.1, 2.0, 6)
+    true = Rotation.from_quat(random_attitudes(rng, 30))
+    b = np.stack([turn.apply(a) for turn in true]) + 0.05 * rng.normal(size=(30, 6, 3))
+    found = nearest_rotation(np.einsum("k,nki,kj->nij", weight, b, a))
+    expected = [Rotation.align_vectors(one, a, weights=weight)[0].as_matrix() for one in b]
+    np.testing.assert_allclose(found, expected, atol=1e-7)

@@ -18,7 +18,7 @@ from fieldcal.cli.main import run
 from fieldcal.config.configuration import load
 from fieldcal.exports.calibration_at import constants_of
 from fieldcal.flight.calibrate import calibrate_log
-from fieldcal.geometry.rotation import FRD_FROM_FLU
+from fieldcal.geometry.frames import FRD_FROM_FLU
 from fieldcal.logs import ingest, log_sha256
 from fieldcal.logs.mcap.write import imu_channel, write_mcap
 from fieldcal.simulation.archive import write_flights

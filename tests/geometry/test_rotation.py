@@ -74,6 +74,16 @@ def test_matrix_there_and_back(q: np.ndarray) -> None:
     assert (back[:, 3] >= 0).all()
 
 
+def test_many_matrices_at_once(q: np.ndarray) -> None:
+    """Every branch of Shepperd's choice, half turns too: along SciPy's quaternion, the largest component positive."""
+    matrices = rotation.body_from_inertial(np.vstack([q, np.eye(4)]))
+    parallel = rotation.parallel_to_quaternion(matrices)
+    expected = Rotation.from_matrix(matrices.transpose(0, 2, 1)).as_quat()
+    assert angle(parallel / np.linalg.norm(parallel, axis=1, keepdims=True), expected).max() < ROUNDING
+    assert (np.max(parallel, axis=1) >= np.max(-parallel, axis=1)).all()
+    assert (np.linalg.norm(parallel, axis=1) > 1.0).all()
+
+
 def test_euler_angles_are_the_321_sequence(q: np.ndarray) -> None:
     heading_pitch_bank = Rotation.from_quat(q).as_euler("ZYX")
     np.testing.assert_allclose(rotation.euler_angles(q), heading_pitch_bank[:, ::-1], atol=1e-9)

@@ -15,8 +15,8 @@ from serial_accuracy import study
 from fieldcal.config.configuration import load, parse
 from fieldcal.config.flight_settings import flight_settings
 from fieldcal.config.parameters import PROFILES
+from fieldcal.geometry.frames import FRD_FROM_FLU, FRD_FROM_FLU_QUATERNION, NED_FROM_ENU_QUATERNION
 from fieldcal.geometry.rotation import (
-    FRD_FROM_FLU,
     angle_between,
     body_from_inertial,
     conjugate,
@@ -30,7 +30,6 @@ from fieldcal.stages.pipeline import PIPELINE, run_flight
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.settings import as_json, from_json, taken_from
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, matrix, triad
-from fieldcal.stages.vps import FLU_FRD, NED_ENU
 
 VECTOR_EXACT, GYRO_EXACT = 1e-6, 1e-3
 EXACT = {"noise": False, "quantisation": False, "band_limit": False}
@@ -144,7 +143,7 @@ def test_a_turned_sensor_in_ros_frames_gives_the_same_numbers(flight: Recording)
 
     t_ns = signals(recording)["imu"]["t_ns"]
     imu = np.hstack([logged("gyroscope"), logged("accelerometer", -1.0)])
-    pose = multiply(multiply(conjugate(NED_ENU), recording.vps_q), conjugate(FLU_FRD))
+    pose = multiply(multiply(conjugate(NED_FROM_ENU_QUATERNION), recording.vps_q), conjugate(FRD_FROM_FLU_QUATERNION))
     tables = {
         "imu": pl.DataFrame({"t_ns": t_ns, **columns_of(imu, triad("gyroscope") + triad("accelerometer"))}),
         "magnetometer": pl.DataFrame(

@@ -3,13 +3,16 @@
 CREATE MACRO calibration_at(temperature_degc) AS TABLE
 SELECT
     l.vehicle_id, l.imu_id, l.sensor, l.method, l.parameter, l.axis,
-    l.value_at_25degc + coalesce(l.slope_per_degc, 0) * (temperature_degc - 25)
-    + coalesce(l.curve_per_degc2, 0) * (temperature_degc - 25) ^ 2
-    + coalesce(l.curve_per_degc3, 0) * (temperature_degc - 25) ^ 3 AS value,
+    l.value_at_25degc + coalesce(l.slope_per_degc, 0) * (temperature_degc - {reference_degc})
+    + coalesce(l.curve_per_degc2, 0) * (temperature_degc - {reference_degc}) ^ 2
+    + coalesce(l.curve_per_degc3, 0) * (temperature_degc - {reference_degc}) ^ 3 AS value,
     sqrt(
         greatest(
             l.sd ^ 2 + coalesce(l.slope_per_degc_sd, 0) ^ 2
-            * ((temperature_degc - coalesce(l.best_known_degc, 25)) ^ 2 - (25 - coalesce(l.best_known_degc, 25)) ^ 2),
+            * (
+                (temperature_degc - coalesce(l.best_known_degc, {reference_degc})) ^ 2
+                - ({reference_degc} - coalesce(l.best_known_degc, {reference_degc})) ^ 2
+            ),
             0
         )
     ) AS sd,

@@ -1,10 +1,11 @@
--- One row an IMU, sensor, parameter and axis: the value at 25 degC, its sd and its slope, where they come from (source)
--- and why. source = 'drift': the unit's trend as of its last flight, which draws a noisy single flight towards the history
--- by its sd; with two to four sessions the siblings lend the scatter and the slope. source = 'flight': the latest value
--- that was not refused, where there is no trend yet, or where it lies more than 5 sd off the trend: what may be the
--- first flight after a step is never averaged away. With a slope it is brought to 25 degC, else taken as it is,
--- whatever its temperature. sd goes with best_known_degc: var(T) = sd^2 +
--- slope_per_degc_sd^2 ((T - best)^2 - (25 - best)^2). Of several methods in a flight the most exact counts.
+-- One row an IMU, sensor, parameter and axis: the value at the reference temperature, its sd and its slope, where they
+-- come from (source) and why. source = 'drift': the unit's trend as of its last flight, which draws a noisy single
+-- flight towards the history by its sd; with two to four sessions the siblings lend the scatter and the slope.
+-- source = 'flight': the latest value that was not refused, where there is no trend yet, or where it lies more than
+-- {unconfirmed_sd} sd off the trend: what may be the first flight after a step is never averaged away. With a slope it
+-- is brought to the reference temperature R, else taken as it is, whatever its temperature. sd goes with
+-- best_known_degc: var(T) = sd^2 + slope_per_degc_sd^2 ((T - best)^2 - (R - best)^2). Of several methods in a flight
+-- the most exact counts.
 CREATE VIEW latest_calibration AS
 WITH latest AS (
     SELECT
@@ -29,12 +30,13 @@ beside AS (
         k.imu_id, k.sensor, k.parameter, k.axis, l, d,
         d.value_at_25degc IS NOT NULL AND (d.status <> 'insufficient' OR d.borrowed_from IS NOT NULL) AS trend,
         coalesce(
-            d.slope_per_degc * (l.at_degc - 25) + coalesce(d.curve_per_degc2, 0) * (l.at_degc - 25) ^ 2
-            + coalesce(d.curve_per_degc3, 0) * (l.at_degc - 25) ^ 3,
+            d.slope_per_degc * (l.at_degc - {reference_degc})
+            + coalesce(d.curve_per_degc2, 0) * (l.at_degc - {reference_degc}) ^ 2
+            + coalesce(d.curve_per_degc3, 0) * (l.at_degc - {reference_degc}) ^ 3,
             0
         ) AS warmer,
         coalesce(d.slope_per_degc_sd, 0) AS slope_sd,
-        coalesce(d.best_known_degc, 25) AS best
+        coalesce(d.best_known_degc, {reference_degc}) AS best
     FROM latest AS k
     LEFT JOIN drift AS d
         ON d.imu_id = k.imu_id AND d.sensor = k.sensor AND d.method = l.method AND d.parameter = k.parameter
@@ -50,7 +52,9 @@ judged AS (
                 WHEN l.started_at > d.as_of THEN abs(l.value - d.value_at_25degc - warmer) / sqrt(
                     coalesce(l.sd, 0) ^ 2 + coalesce(d.session_sd, 0) ^ 2
                     + greatest(
-                        d.sd ^ 2 + slope_sd ^ 2 * ((coalesce(l.at_degc, best) - best) ^ 2 - (25 - best) ^ 2), 1e-300
+                        d.sd ^ 2
+                        + slope_sd ^ 2 * ((coalesce(l.at_degc, best) - best) ^ 2 - ({reference_degc} - best) ^ 2),
+                        1e-300
                     )
                 )
                 ELSE 0
@@ -58,13 +62,15 @@ judged AS (
         ) AS off
     FROM beside
 ),
-chosen AS (SELECT *, trend AND NOT off > 5 AS by_trend, trend AND off > 5 AS beyond FROM judged)
+chosen AS (
+    SELECT *, trend AND NOT off > {unconfirmed_sd} AS by_trend, trend AND off > {unconfirmed_sd} AS beyond FROM judged
+)
 SELECT
     l.vehicle_id, imu_id, sensor, l.method, parameter, axis,
     CASE WHEN by_trend THEN d.value_at_25degc WHEN beyond THEN l.value - warmer ELSE l.value END AS value_at_25degc,
     CASE
         WHEN by_trend THEN d.sd
-        WHEN beyond THEN sqrt(l.sd ^ 2 + (slope_sd * coalesce(l.at_degc - 25, 0)) ^ 2)
+        WHEN beyond THEN sqrt(l.sd ^ 2 + (slope_sd * coalesce(l.at_degc - {reference_degc}, 0)) ^ 2)
         ELSE l.sd
     END AS sd,
     CASE WHEN trend THEN d.slope_per_degc END AS slope_per_degc,
@@ -84,7 +90,7 @@ SELECT
             off, d.n_flights
         )
         WHEN by_trend AND d.borrowed_from IS NOT NULL THEN printf(
-            'Mean of %d sessions, weighted by the scatter of %d siblings, whose slope brings them to 25 degC.',
+            'Mean of %d sessions, weighted by the scatter of %d siblings, whose slope brings them to {reference_degc} degC.',
             d.n_sessions, d.borrowed_from
         )
         WHEN by_trend THEN concat(

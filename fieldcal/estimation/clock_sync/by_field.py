@@ -14,13 +14,16 @@ from numpy.typing import ArrayLike
 
 from fieldcal.estimation.clock_sync.by_rates import SyncFit
 from fieldcal.estimation.motion_selection import contiguous
+from fieldcal.estimation.robust import reweighted
 from fieldcal.estimation.smoothing import differentiate_samples
-from fieldcal.estimation.statistics import huber_inflation, huber_weights, least_squares_covariance, robust_sigma
+from fieldcal.estimation.statistics import huber_inflation, least_squares_covariance, robust_sigma
+from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array, body_from_inertial, body_rate, continuous, hermite, skew
 
 RATE_WINDOW_S, SHORTEST_BLOCK = 0.03, 12
 MIN_READINGS = 200
 MAX_ITERATIONS = 12
+REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock
 ELEMENTS = 10  # of A(q), and the bias
 # χ²₂ of the difference to the gyroscope's clock: by chance one flight in a thousand.
 AGREEMENT = 13.8
@@ -80,7 +83,7 @@ def _clock(
     lag, skewed = fit.lag_mid_s, 1e-6 * fit.skew_ppm
     for _ in range(MAX_ITERATIONS):
         at = (t - fit.reference_s) * (1 + skewed) + fit.reference_s - lag
-        i = np.clip(np.searchsorted(t_vps, at, side="right") - 1, 0, len(t_vps) - 2)
+        i = interval_of(t_vps, at)
         turning = np.column_stack([np.interp(at, t_vps, c) for c in rate.T])
         inside = (at >= t_vps[0]) & (at <= t_vps[-1]) & (t_vps[i + 1] - t_vps[i] <= max_gap_s)
         inside &= np.isfinite(turning).all(axis=1)
@@ -119,11 +122,12 @@ def block_rates(t: Array, q: Array, max_gap_s: float) -> Array:
 
 def _regressed(x: Array, y: Array) -> tuple[Array, Array, Array]:
     """y (n, 3) on x (n, m), robust: weights (n,), coefficients (m, 3), residuals (n, 3)."""
-    weight: Array = np.ones(len(x))
-    for _ in range(3):
+
+    def solve(weight: Array) -> tuple[tuple[Array, Array], Array]:
         root = np.sqrt(weight)[:, None]
         coefficients = np.linalg.lstsq(x * root, y * root, rcond=1e-10)[0]
         residual = y - x @ coefficients
-        length = np.linalg.norm(residual / [robust_sigma(r) for r in residual.T], axis=1)
-        weight = huber_weights(length, robust_sigma(length))
+        return (coefficients, residual), np.linalg.norm(residual / [robust_sigma(r) for r in residual.T], axis=1)
+
+    (coefficients, residual), weight = reweighted(solve, len(x), rounds=REGRESSION_ROUNDS)
     return weight, coefficients, residual

@@ -14,9 +14,12 @@ from numpy.typing import ArrayLike
 from scipy import fft
 
 from fieldcal.errors import UnusableFlight
+from fieldcal.estimation.robust import reweighted
 from fieldcal.estimation.smoothing import differentiate, low_pass
-from fieldcal.estimation.statistics import huber_weights, least_squares_covariance, robust_sigma
+from fieldcal.estimation.statistics import least_squares_covariance, robust_sigma
+from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import (
+    IDENTITY,
     Array,
     body_rate,
     conjugate,
@@ -29,6 +32,7 @@ from fieldcal.geometry.rotation import (
 )
 
 FINE_CUTOFF_HZ = 8.0
+REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock
 # Chance peaks of unrelated motions reach 0.9 in the coarse correlation; the vector fit tells them.
 MIN_EXPLAINED, MAX_SKEW_PPM, MAX_LAG_SD_S = 0.6, 2000.0, 0.01
 
@@ -137,7 +141,7 @@ def vps_rates(t: ArrayLike, q: ArrayLike, interval_s: float, *, max_gap_s: float
     t, q = np.asarray(t, dtype=float), continuous(q)
     grid = t[0] + interval_s * np.arange(int((t[-1] - t[0]) / interval_s))
     on_grid = slerp(t, q, grid)
-    i = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 2)
+    i = interval_of(t, grid)
     valid = (t[i + 1] - t[i]) <= max_gap_s
     # The derivative at a place uses its neighbours: grow the gaps by the window.
     spoiled = np.convolve(~valid, np.ones(9), mode="same") > 0
@@ -149,7 +153,7 @@ def imu_rates(t: ArrayLike, rate: ArrayLike, interval_s: float, *, max_gap_s: fl
     """IMU rates (n, 3) at stamps t (n,) on a uniform grid, linear in between; gaps masked."""
     t, rate = np.asarray(t, dtype=float), np.asarray(rate, dtype=float)
     grid = t[0] + interval_s * np.arange(int((t[-1] - t[0]) / interval_s))
-    i = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 2)
+    i = interval_of(t, grid)
     valid = (t[i + 1] - t[i]) <= max_gap_s
     on_grid = np.stack([np.interp(grid, t, column) for column in rate.T], axis=1)
     return UniformRates(float(t[0]), interval_s, on_grid, valid)
@@ -280,7 +284,8 @@ def _refine(
 
     spline = CubicSpline(vps.t, vps.rate)
     slope = spline.derivative()
-    skew, matrix = 0.0, np.eye(3)
+    skew = 0.0
+    matrix: Array = np.eye(3)
     t = imu.t
     for _ in range(12):
         # t_vps = (t − middle)(1 + skew) + middle − lag
@@ -290,14 +295,8 @@ def _refine(
         inside[inside] = vps.valid[nearest[inside].astype(int)]
         w, w_dot = spline(at[inside]), slope(at[inside])
         x = np.column_stack([w, np.ones(len(w))])
-        weight: Array = np.ones(len(w))
-        for _ in range(3):
-            xw = x * weight[:, None]
-            solution = np.linalg.lstsq(xw.T @ x, xw.T @ imu.rate[inside], rcond=None)[0]
-            residual = imu.rate[inside] - x @ solution
-            length = np.linalg.norm(residual, axis=1)
-            weight = huber_weights(length, robust_sigma(length))
-        matrix = solution[:3].T
+        (affine, residual, xw), weight = _regressed(x, imu.rate[inside])
+        matrix = affine[:3].T
         # Sensitivity of the prediction to lag (minus) and skew; the affine map's own columns are projected out.
         moved = w_dot @ matrix.T
         columns = np.stack([-moved, moved * (t[inside] - middle)[:, None]], axis=2)
@@ -328,10 +327,17 @@ def _refine(
     )
 
 
-def rotation_between(a: ArrayLike, b: ArrayLike) -> Array:
-    """The rotation (3, 3) with b ≈ R a for vectors (n, 3): Wahba by SVD."""
-    u, _, vt = np.linalg.svd(np.asarray(b, dtype=float).T @ np.asarray(a, dtype=float))
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
+def _regressed(x: Array, y: Array) -> tuple[tuple[Array, Array, Array], Array]:
+    """y (n, 3) on x (n, m), robust: coefficients (m, 3), residuals (n, 3) and the weighted x of the last round; the
+    weights (n,) that those residuals give."""
+
+    def solve(weight: Array) -> tuple[tuple[Array, Array, Array], Array]:
+        xw = x * weight[:, None]
+        coefficients = np.linalg.lstsq(xw.T @ x, xw.T @ y, rcond=None)[0]
+        residual = y - x @ coefficients
+        return (coefficients, residual, xw), np.linalg.norm(residual, axis=1)
+
+    return reweighted(solve, len(x), rounds=REGRESSION_ROUNDS)
 
 
 def align_frames(q_imu: ArrayLike, q_vps: ArrayLike, *, iterations: int = 10) -> tuple[Array, Array]:
@@ -340,12 +346,13 @@ def align_frames(q_imu: ArrayLike, q_vps: ArrayLike, *, iterations: int = 10) ->
     Alternating Wahba solutions over matched attitudes (n, 4), robust to single bad ones; where the motion
     leaves a part of one unobserved, it stays at the identity's side."""
     q_imu, q_vps = np.asarray(q_imu, dtype=float), np.asarray(q_vps, dtype=float)
-    body = np.array([0.0, 0.0, 0.0, 1.0])
-    weight: Array = np.ones(len(q_imu))
-    for _ in range(iterations):
+    body = IDENTITY
+
+    def solve(weight: Array) -> tuple[tuple[Array, Array], Array]:
+        nonlocal body
         world = mean_quaternion(multiply(q_imu, conjugate(multiply(q_vps, body))), weight)
         body = mean_quaternion(multiply(conjugate(multiply(world, q_vps)), q_imu), weight)
         error = to_rotation_vector(multiply(conjugate(multiply(multiply(world, q_vps), body)), q_imu))
-        length = np.linalg.norm(error, axis=1)
-        weight = huber_weights(length, robust_sigma(length))
-    return world, body
+        return (world, body), np.linalg.norm(error, axis=1)
+
+    return reweighted(solve, len(q_imu), rounds=iterations)[0]

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldcal.errors import UnusableFlight
-from fieldcal.estimation.statistics import huber_inflation, huber_weights, least_squares_covariance, robust_sigma
+from fieldcal.estimation.robust import reweighted
+from fieldcal.estimation.statistics import huber_inflation, least_squares_covariance
 from fieldcal.geometry.rotation import Array, body_rate, rate_matrix
 
 
@@ -28,6 +29,7 @@ class GyroFit:
     iterations: int = 1
 
 
+ROBUST_ROUNDS = 6
 NOISE_DENSITY_SD = 0.25
 """The attenuation by noise is corrected to this share of itself: a sensor's noise is not quite white."""
 MOST_ATTENUATION = 0.2
@@ -124,19 +126,23 @@ def _robust_solve(
     """Weighted least squares (Huber-refined when `robust`): θ (p,), residual (n,), its two covariances (p, p).
 
     `share` of the mean square of the first regressor, 1, is noise."""
-    weight = trust
-    inflation = 1.0
-    for _ in range(6 if robust else 1):
+
+    def solve(huber: Array) -> tuple[tuple[Array, Array], Array]:
+        weight = trust * huber
         weighted = sensitivity * weight[:, None]
         normal = weighted.T @ sensitivity
         normal[0, 0] -= share * weight.sum()
         theta = np.linalg.solve(normal, weighted.T @ target)
         residual = target - sensitivity @ theta
-        if robust:
-            huber = huber_weights(residual, robust_sigma(residual))
-            weight = trust * huber
-            inflation = huber_inflation(huber)
-    white, coloured = _covariances(sensitivity, residual, weight)
+        return (theta, residual), residual
+
+    huber: Array = np.ones(len(trust))
+    if robust:
+        (theta, residual), huber = reweighted(solve, len(trust), rounds=ROBUST_ROUNDS)
+    else:
+        (theta, residual), _ = solve(huber)
+    inflation = huber_inflation(huber) if robust else 1.0
+    white, coloured = _covariances(sensitivity, residual, trust * huber)
     stretch = np.ones(len(theta))
     stretch[0] /= 1.0 - share
     both = np.outer(stretch, stretch)

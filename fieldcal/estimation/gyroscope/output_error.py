@@ -7,15 +7,15 @@ initial attitude of its own that is eliminated (multiple shooting).
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldcal.errors import EstimationError
 from fieldcal.estimation.gyroscope.equation_error import GyroFit, from_centred
+from fieldcal.estimation.segments import begins_run, run_bounds
 from fieldcal.estimation.statistics import huber_inflation, huber_weights, least_squares_covariance, robust_sigma
 from fieldcal.geometry.rotation import (
+    IDENTITY,
     Array,
     body_from_inertial,
     conjugate,
@@ -34,9 +34,8 @@ def shooting_segments(t: ArrayLike, segment: ArrayLike, longest_s: float) -> np.
     """Number the stretches to integrate: contiguous `segment`s (n,) cut into equal parts of at most `longest_s`."""
     t, segment = np.asarray(t, dtype=float), np.asarray(segment)
     out = np.empty(len(t), dtype=np.int64)
-    starts = np.flatnonzero(np.r_[True, segment[1:] != segment[:-1]])
     number = 0
-    for a, b in zip(starts, np.r_[starts[1:], len(t)], strict=True):
+    for a, b in run_bounds(segment):
         parts = max(1, int(np.ceil((t[b - 1] - t[a]) / longest_s)))
         edges = np.linspace(t[a], t[b - 1], parts + 1)[1:-1]
         out[a:b] = number + np.searchsorted(edges, t[a:b], side="right")
@@ -47,9 +46,9 @@ def shooting_segments(t: ArrayLike, segment: ArrayLike, longest_s: float) -> np.
 def propagate_stretches(t: Array, rate: Array, stretch: Array) -> Array:
     """Attitude (n, 4) relative to the start of each stretch from body rates (n, 3), rad/s."""
     steps = from_rotation_vector(rotation_steps(t, rate))
-    first = np.r_[True, stretch[1:] != stretch[:-1]]
-    chain = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], steps])
-    chain[first] = 0.0, 0.0, 0.0, 1.0
+    first = begins_run(stretch)
+    chain = np.concatenate([[IDENTITY], steps])
+    chain[first] = IDENTITY
     # One scan over everything; dividing by its value at each start makes every stretch begin at the identity.
     total = cumulative_product(chain)
     starts = np.flatnonzero(first)
@@ -60,8 +59,7 @@ def start_stretches(relative: Array, q: Array, stretch: Array, weight: Array, *,
     """Initial attitudes put on: the best rotation of each stretch onto the measured attitudes, or its first sample
     (`fixed`)."""
     out = np.empty_like(relative)
-    bounds = np.r_[np.flatnonzero(np.r_[True, stretch[1:] != stretch[:-1]]), len(stretch)]
-    for a, b in pairwise(bounds):
+    for a, b in run_bounds(stretch):
         start = q[a] if fixed else mean_quaternion(multiply(q[a:b], conjugate(relative[a:b])), weight[a:b])
         out[a:b] = multiply(start, relative[a:b])
     return out
@@ -82,13 +80,13 @@ def random_walk(t: Array, residual: Array, stretch: np.ndarray, weight: Array) -
     From means over twelfths of a stretch: how much further apart they are half a stretch away than next to each other.
     What is stationary in the residual (the attitude's own error) averages out in the means and is as far apart at both
     distances."""
-    starts = np.flatnonzero(np.r_[True, stretch[1:] != stretch[:-1]])
-    lengths = np.diff(np.r_[starts, len(stretch)])
+    bounds = run_bounds(stretch)
+    lengths = [stop - start for start, stop in bounds]
     typical, apart = float(np.median(lengths)), BLOCKS // 2
     size = max(1, int(typical) // BLOCKS)
     interval = float(np.median(np.diff(t)))
     near, far = [], []
-    for start, length in zip(starts.tolist(), lengths.tolist(), strict=True):
+    for (start, _), length in zip(bounds, lengths, strict=True):
         count = length // size
         if count <= apart:
             continue
@@ -197,7 +195,7 @@ def fit_output_error(
     x = (w_d - centre) / x_scale  # parameters scaled to O(1): absolute tolerances on λ ≈ 2e-4 would pass at once
     theta = np.concatenate([start.scale * x_scale, start.bias + start.scale * centre])
     weight, inflation = trust, 1.0
-    first = np.r_[True, stretch[1:] != stretch[:-1]]
+    first = begins_run(stretch)
     dt = np.where(first[1:], 0.0, np.diff(t))
     for iteration in range(1, max_iterations + 1):
         residual, model = attitude_error(t, q, theta[:3] * x + theta[3:], stretch, weight, fixed=fixed)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.smoothing import fill, lattice, low_pass_weights
 from fieldcal.geometry.rotation import Array
 
@@ -36,7 +37,6 @@ def smoothed_noise_variance(
     """
     stamps, x, label = np.asarray(t, dtype=float), np.asarray(logged, dtype=float), np.asarray(segment)
     none = np.zeros(x.shape[1])
-    starts = np.flatnonzero(np.r_[True, label[1:] != label[:-1]])
     power, blocks = none, 0
     interval = float(np.median(np.diff(stamps)))
     length = round(BLOCK_S / interval)
@@ -48,7 +48,7 @@ def smoothed_noise_variance(
     if band.sum() < LEAST_BINS:
         return none
     window = np.hanning(length + 1)[:-1, None]
-    for a, b in zip(starts, np.r_[starts[1:], len(x)], strict=True):
+    for a, b in run_bounds(label):
         if b - a < length:
             continue
         even = fill(lattice(stamps[a:b])[0], x[a:b])

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import dct
 
+from fieldcal.estimation.segments import true_runs
 from fieldcal.geometry.rotation import Array
 
 # Shorter periods are left out: there attitude noise, not the gyroscope's, is what the rates show. So are all but the
@@ -40,8 +41,7 @@ def bias_walk(rate: ArrayLike, interval_s: ArrayLike, joined: ArrayLike) -> floa
     if not joined.any():
         return 0.0
     step = float(np.mean(np.asarray(interval_s, dtype=float)[joined]))
-    edge = np.flatnonzero(np.diff(np.r_[False, joined, False]))
-    parts = [_spectrum(rate[a:b], step) for a, b in zip(edge[0::2], edge[1::2], strict=True)]
+    parts = [_spectrum(rate[a:b], step) for a, b in zip(*true_runs(joined), strict=True)]
     power, gain = (np.concatenate(own) for own in zip(*parts, strict=True))
     if len(power) < 2 or not power.any():
         return 0.0

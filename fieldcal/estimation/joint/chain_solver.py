@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import expm, solve_continuous_lyapunov
 
 from fieldcal.errors import EstimationError
+from fieldcal.estimation.segments import run_bounds
 from fieldcal.geometry.rotation import Array
 
 # Where the acceleration has most power; a tenth of it is left at a quarter and at four times this frequency.
@@ -60,9 +61,8 @@ class Motion:
 def place_knots(t: Array, segment: np.ndarray, spacing_s: float) -> Knots:
     """Tie contiguous segments at equal parts of at most `spacing_s`, on samples, both ends included."""
     n = len(t)
-    starts = np.flatnonzero(np.r_[True, segment[1:] != segment[:-1]])
     index = []
-    for a, b in zip(starts, np.r_[starts[1:], n], strict=True):
+    for a, b in run_bounds(segment):
         parts = max(1, int(np.ceil((t[b - 1] - t[a]) / spacing_s)))
         edges = np.searchsorted(t[a:b], np.linspace(t[a], t[b - 1], parts + 1)[1:-1]) + a
         index.append(np.unique(np.r_[a, edges, b - 1]))

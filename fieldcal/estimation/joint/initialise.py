@@ -13,7 +13,8 @@ from fieldcal.estimation.ellipsoid import fit_ellipsoid
 from fieldcal.estimation.gyroscope.equation_error import fit_equation_error
 from fieldcal.estimation.gyroscope.output_error import propagate_stretches
 from fieldcal.estimation.joint.chain_solver import STATES, place_knots
-from fieldcal.estimation.joint.problem import Model, Readings, State, averaging_side, stretches
+from fieldcal.estimation.joint.problem import Model, Readings, State, averaging_side
+from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.smoothing import differentiate_samples, fill, lattice, smooth_samples
 from fieldcal.geometry.rotation import (
     Array,
@@ -41,7 +42,7 @@ Constants = tuple[Array, Array]
 def low_passed(t: Array, segment: np.ndarray, x: Array, cutoff_hz: float, side_s: float) -> Array:
     """Fixed-weight low-pass by contiguous segment."""
     out = np.empty_like(x)
-    for a, b in stretches(segment):
+    for a, b in run_bounds(segment):
         out[a:b] = smooth_samples(t[a:b], x[a:b], cutoff_hz, side_s=side_s)
     return out
 
@@ -50,14 +51,14 @@ def turning(t: Array, segment: np.ndarray, gyroscope: Array) -> Array:
     """Low-passed gyroscope and its derivative (2, n, 3), logged units: `Readings.turning`."""
     low = low_passed(t, segment, gyroscope, _fastest_turning_hz(t, segment, gyroscope), TURNING_SIDE_S)
     change = np.empty_like(low)
-    for a, b in stretches(segment):
+    for a, b in run_bounds(segment):
         change[a:b] = differentiate_samples(t[a:b], low[a:b])
     return np.stack([low, change])
 
 
 def _fastest_turning_hz(t: Array, segment: np.ndarray, gyroscope: Array) -> float:
     """Up to which frequency the longest stretch's spectrum stands out of the gyroscope's noise, axes taken together."""
-    a, b = max(stretches(segment), key=lambda own: own[1] - own[0])
+    a, b = max(run_bounds(segment), key=lambda own: own[1] - own[0])
     index, interval_s = lattice(t[a:b])
     x = fill(index, gyroscope[a:b])
     frequency, density = welch(x, 1.0 / interval_s, nperseg=min(len(x), round(SPECTRUM_S / interval_s)), axis=0)
@@ -200,7 +201,7 @@ def _gyro_from_attitude(r: Readings, q: Array) -> Constants:
     """Equation error on the start's attitudes, both sides low-passed alike."""
     logged = low_passed(r.t, r.segment, r.gyroscope, START_CUTOFF_HZ, 0.5)
     q_dot = np.empty_like(q)
-    for a, b in stretches(r.segment):
+    for a, b in run_bounds(r.segment):
         q_dot[a:b] = differentiate_samples(r.t[a:b], q[a:b], window_s=0.05)
     try:
         fit = fit_equation_error(q, q_dot, logged)

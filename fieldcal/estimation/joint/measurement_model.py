@@ -11,6 +11,7 @@ import numpy as np
 from fieldcal.estimation.joint.chain_solver import BRIDGE, GRADIENT, SENSORS, Knots, Normal, Probe
 from fieldcal.estimation.joint.problem import CROSS, OPTIONAL, TERMS, Model, State, corrected
 from fieldcal.geometry.rotation import (
+    IDENTITY,
     Array,
     body_from_inertial,
     conjugate,
@@ -60,12 +61,11 @@ def _since_knots(knots: Knots, steps: Array) -> tuple[Array, Array]:
     samples: a scan in step over all intervals."""
     count = np.diff(knots.index)
     step = np.arange(int(count.max()))[:, None]
-    nothing = np.array([0.0, 0.0, 0.0, 1.0])
     own = np.where(
-        ((step < count) & knots.joined)[..., None], steps[np.minimum(knots.index[:-1] + step, len(steps) - 1)], nothing
+        ((step < count) & knots.joined)[..., None], steps[np.minimum(knots.index[:-1] + step, len(steps) - 1)], IDENTITY
     )
     total = np.empty((len(step) + 1, len(count) + 1, 4))
-    total[0], total[:, -1] = nothing, nothing
+    total[0], total[:, -1] = IDENTITY, IDENTITY
     for i in range(len(step)):
         total[i + 1, :-1] = multiply(total[i, :-1], own[i])
     offset = np.arange(len(steps) + 1) - knots.index[knots.of_sample]

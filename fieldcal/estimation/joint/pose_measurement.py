@@ -18,7 +18,9 @@ from fieldcal.estimation.joint.chain_solver import GRADIENT, Normal
 from fieldcal.estimation.joint.measurement_model import Trajectory
 from fieldcal.estimation.joint.problem import OPTIONAL, Model, State
 from fieldcal.estimation.statistics import robust_sigma, white_noise_sigma
+from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import (
+    IDENTITY,
     Array,
     body_from_inertial,
     conjugate,
@@ -64,9 +66,8 @@ class VpsRecord:
         q = continuous(q)
         turned = to_rotation_vector(multiply(q[1:], conjugate(q[:-1])))
         noise = float(np.max(white_noise_sigma(np.cumsum(turned, axis=0))))
-        none = np.array([0.0, 0.0, 0.0, 1.0])
         every = np.ones(len(model.knots.index), dtype=bool)
-        record = cls(t, q, block_rates(t, q, max_gap_s), max_gap_s, clock, none, none, every, noise)
+        record = cls(t, q, block_rates(t, q, max_gap_s), max_gap_s, clock, IDENTITY, IDENTITY, every, noise)
         at_knots, known = record._read(model, np.zeros(2))
         if known.sum() < MIN_POSES:
             return None
@@ -114,7 +115,7 @@ class VpsRecord:
         lag, skew = self.clock_of({"vps_clock": correction})
         middle = self.clock.reference_s
         at = (model.readings.t[model.knots.index] - middle) * (1 + skew) + middle - lag
-        i = np.clip(np.searchsorted(self.t, at, side="right") - 1, 0, len(self.t) - 2)
+        i = interval_of(self.t, at)
         known = (at >= self.t[0]) & (at <= self.t[-1]) & (self.t[i + 1] - self.t[i] <= self.max_gap_s)
         return hermite(self.t, self.q, self.rate, at), known
 

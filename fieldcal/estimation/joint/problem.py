@@ -9,6 +9,7 @@ import numpy as np
 
 from fieldcal.estimation.gyroscope.equation_error import from_centred
 from fieldcal.estimation.joint.chain_solver import Knots
+from fieldcal.estimation.segments import run_bounds
 from fieldcal.geometry.rotation import Array, from_rotation_vector, multiply
 
 MAX_TURN_RAD, MAX_AVERAGE_S = 0.1, 0.02
@@ -65,12 +66,6 @@ class Readings:
             turning=self.turning[:, own],
             warmth=cut(self.warmth),
         )
-
-
-def stretches(segment: np.ndarray) -> list[tuple[int, int]]:
-    """Bounds [a, b) of the contiguous segments."""
-    starts = np.flatnonzero(np.r_[True, segment[1:] != segment[:-1]])
-    return list(zip(starts.tolist(), [*starts[1:].tolist(), len(segment)], strict=True))
 
 
 def averaging_side(readings: Readings, rate_radps: float) -> int:
@@ -154,7 +149,7 @@ class Model:
         triads = {name: Centred.of(x) for name, x in given.items() if x is not None and np.isfinite(x).any()}
         rows = tuple(name for name in TRIADS[1:] if name in triads)
         at = np.concatenate(
-            [np.arange(a + side, b - side, 2 * side + 1) for a, b in stretches(readings.segment) if b - a > 2 * side]
+            [np.arange(a + side, b - side, 2 * side + 1) for a, b in run_bounds(readings.segment) if b - a > 2 * side]
         )
         triads = {name: x.averaged(at, side) if name in rows else x for name, x in triads.items()}
         return cls(readings, triads, knots, rows, at)

@@ -9,6 +9,7 @@ from scipy.ndimage import uniform_filter1d
 
 from fieldcal.estimation.joint.measurement_model import Trajectory
 from fieldcal.estimation.joint.problem import Model, State
+from fieldcal.estimation.segments import true_runs
 from fieldcal.estimation.statistics import robust_sigma, white_noise_sigma
 from fieldcal.geometry.rotation import Array
 
@@ -120,8 +121,7 @@ def passing_fields(model: Model, weight: Array) -> np.ndarray:
         return np.zeros(len(model.at), dtype=bool)
     known = model.triads["magnetometer"].known
     lost = known & (weight[:, 3 * rows.index("magnetometer")] < LOST)
-    edge = np.flatnonzero(np.diff(np.r_[False, lost, False]))
-    first, past = edge[0::2], edge[1::2]
+    first, past = true_runs(lost)
     reach = (BURST_EDGE * (past - first)).astype(int)
     first, past = np.maximum(first - reach, 0)[reach > 0], np.minimum(past + reach, len(lost))[reach > 0]
     change = np.bincount(first, minlength=len(lost) + 1) - np.bincount(past, minlength=len(lost) + 1)

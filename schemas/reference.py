@@ -1,0 +1,10 @@
+"""Numbers that columns and views are defined by: said once here, for the code and for SQL."""
+
+from __future__ import annotations
+
+REFERENCE_DEGC = 25.0
+"""Temperature, °C, of `value_at_25degc` and of the slopes and bends beside it."""
+
+UNCONFIRMED_SD = 5.0
+"""Distance of the latest flight from its trend, in sd, beyond which it may be the first after a step: it stands alone
+until another session confirms it."""

@@ -1,0 +1,16 @@
+"""The text of a view: its SQL file with the numbers put in that the code uses too."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+
+from fieldcal.schemas.reference import REFERENCE_DEGC, UNCONFIRMED_SD
+
+VALUES = {"reference_degc": f"{REFERENCE_DEGC:g}", "unconfirmed_sd": f"{UNCONFIRMED_SD:g}"}
+"""What stands for each `{name}` in the files of `views/`."""
+
+
+def view_text(name: str) -> str:
+    """The statement that makes a view. Raises KeyError where its file has a placeholder that `VALUES` lacks."""
+    text = (files("fieldcal.warehouse") / "views" / f"{name}.sql").read_text(encoding="utf-8")
+    return text.format_map(VALUES)
