@@ -297,6 +297,15 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
 def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: FlightSettings) -> StageResult:
     """Run one stage on `stage.table` tables; missing needs end as a refusal that names them."""
     inputs = {own: tables[name] for own, name in stage.reads.items() if name in tables}
+    result = refused_beforehand(stage, inputs)
+    if result is None:
+        result = stage.function(inputs, taken_from(settings, stage.takes))
+        _check_written(stage, result)
+    return result
+
+
+def refused_beforehand(stage: Stage, inputs: Mapping[str, pl.DataFrame]) -> StageResult | None:
+    """The refusal of a stage that is not to run on these inputs: a sensor is faulty, or something needed is missing."""
     # An attitude is as good as the vectors that it came from.
     for faults, sensors in (("faults", stage.trusts), ("attitude_faults", VECTOR_SENSORS)):
         fault = fatal_fault(inputs[faults], sensors) if faults in inputs else None
@@ -315,9 +324,7 @@ def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: Flight
                 reason_code=f"no_{need}",
                 reason=f"{stage.name} needs {stage.reads[need]}, which {source} could not give.",
             )
-    result = stage.function(inputs, taken_from(settings, stage.takes))
-    _check_written(stage, result)
-    return result
+    return None
 
 
 def _check_written(stage: Stage, result: StageResult) -> None:
