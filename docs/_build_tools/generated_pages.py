@@ -31,6 +31,8 @@ def commands() -> str:
     """Every command and option, from the command line itself."""
     text = str(command_line.generate_docs(output_format="markdown"))
     text = re.sub(r"## Table of Contents.*?(?=\*\*Commands\*\*)", "", text, flags=re.DOTALL)
+    # cyclopts takes the program that is running for part of the usage.
+    text = re.sub(r"^(fieldcal [\w-]+) (?:-m )?[\w-]*sphinx[\w-]*(?= )", r"\1", text, flags=re.MULTILINE)
     return re.sub(r"\A# .*\n", "# Command line\n", text)
 
 
