@@ -68,11 +68,14 @@ def _allowed(p: Parameter) -> str:
 def python() -> str:
     """The public names of the package, its warehouse and its errors."""
     names = [name for name in getattr(fieldcal, "__all__", ()) if not name.startswith("_")]
-    entries = [f".. {_directive(getattr(fieldcal, name))}:: fieldcal.{name}" for name in names]
-    rooms = ["fieldcal.warehouse.query", "fieldcal.logs", "fieldcal.logs.interface", errors.__name__]
-    entries += [f".. automodule:: {room}" for room in rooms]
-    blocks = [f"```{{eval-rst}}\n{entry}\n   :members:\n```\n" for entry in entries]
-    return "# Python\n\n" + "\n".join(blocks)
+    blocks = [_entry(f"fieldcal.{name}", _directive(getattr(fieldcal, name))) for name in names]
+    rooms = ("fieldcal.warehouse.query", "fieldcal.logs", "fieldcal.logs.interface", errors.__name__)
+    return "# Python\n\n" + "\n".join(blocks + [_entry(room, "automodule") for room in rooms])
+
+
+def _entry(name: str, directive: str) -> str:
+    members = "" if directive in ("autofunction", "autodata") else "   :members:\n"
+    return f"```{{eval-rst}}\n.. {directive}:: {name}\n{members}```\n"
 
 
 def _directive(public: object) -> str:
