@@ -7,7 +7,6 @@ not be imported before `prepare_environment`.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import socket
@@ -24,6 +23,7 @@ from typing import Any, Self
 
 import fieldcal
 from fieldcal.errors import FieldcalError
+from fieldcal.file_locks import fcntl
 
 START_TIMEOUT_S = 180.0
 ANSWER_TIMEOUT_S = 5.0

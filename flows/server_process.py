@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import signal
 import sys
 import threading
 import time
+
+from fieldcal.file_locks import fcntl
 
 POLL_S = 0.25
 UNUSED_S = 2.0

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
@@ -16,8 +14,6 @@ from fieldcal.config.configuration import CsvMap, McapMap, Vehicle, load
 from fieldcal.logs.mcap import write as mcap_writer
 
 EPOCH_NS = 1_700_000_000_000_000_000
-EXAMPLES = os.environ.get("FIELDCAL_EXAMPLE_LOGS")
-needs_examples = pytest.mark.skipif(not EXAMPLES, reason="FIELDCAL_EXAMPLE_LOGS names no folder of example logs")
 
 
 def vehicle(*, csv: CsvMap | None = None, mcap: McapMap | None = None, units: dict[str, str] | None = None) -> Vehicle:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import time
@@ -13,6 +12,7 @@ from types import TracebackType
 from typing import Self, TypeAlias
 from uuid import uuid4
 
+from fieldcal.file_locks import fcntl
 from fieldcal.warehouse.errors import disk
 
 TEMPORARY = ".tmp"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from fieldcal.file_locks import fcntl
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.layout import lock_path, prepare
 

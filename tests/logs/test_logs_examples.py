@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from logs_support import EXAMPLES, messages_by_mcap_ros2, needs_examples, stamp_ns
+from example_logs import EXAMPLES, needs_examples
+from logs_support import messages_by_mcap_ros2, stamp_ns
 
 from fieldcal.config.configuration import Configuration, load
 from fieldcal.errors import UnreadableLog
@@ -19,24 +20,23 @@ from fieldcal.logs.ingest import read_flight, settings_of
 from fieldcal.stages.pipeline import PIPELINE, run_stage
 
 pytestmark = needs_examples
-ROOT = Path(EXAMPLES or ".")
 TABLES = {"/imu/data_raw": "imu", "/imu/mag": "magnetometer", "/vps/pose": "vps"}
 
 
 @pytest.fixture(scope="module")
 def configuration() -> Configuration:
-    return load(ROOT / "fieldcal.toml")
+    return load(EXAMPLES / "fieldcal.toml")
 
 
 @pytest.fixture(scope="module")
 def expected() -> dict[str, Any]:
-    stated: dict[str, Any] = json.loads((ROOT / "expected.json").read_text())
+    stated: dict[str, Any] = json.loads((EXAMPLES / "expected.json").read_text())
     return stated
 
 
 def test_every_log_is_read_or_refused(configuration: Configuration) -> None:
     refused = {}
-    for log in find_logs(ROOT):
+    for log in find_logs(EXAMPLES):
         try:
             reader = open_log(log.path, configuration.vehicle(log.vehicle_id))
             assert sum(len(columns["t_ns"]) for _, columns in reader.batches()) > 1000
@@ -53,14 +53,14 @@ def test_damaged_mcap_gives_exactly_the_salvageable_messages(
     for uri, stated in expected.items():
         if "salvageable_messages" not in stated:
             continue
-        frames, summary = read_log(ROOT / uri, configuration.vehicle("damaged-si"))
+        frames, summary = read_log(EXAMPLES / uri, configuration.vehicle("damaged-si"))
         assert summary.counts == {TABLES[topic]: n for topic, n in stated["salvageable_messages"].items()}
         assert [finding.code for finding in summary.findings] == [
             "damaged_chunk" if "lost_messages" in stated else "truncated"
         ]
         for topic, lost in stated.get("lost_messages", {}).items():
             assert f"{topic} {lost}" in summary.findings[0].sentence
-        sound, _ = read_log(ROOT / "broad-imu-1/2026-05-11-B/broad_02.mcap", configuration.vehicle("broad-imu-1"))
+        sound, _ = read_log(EXAMPLES / "broad-imu-1/2026-05-11-B/broad_02.mcap", configuration.vehicle("broad-imu-1"))
         for table, frame in frames.items():
             assert frame.join(sound[table], on=frame.columns, how="semi").height == frame.height
 
@@ -69,14 +69,14 @@ def test_damaged_csv_keeps_all_whole_rows(configuration: Configuration, expected
     for uri, stated in expected.items():
         if not uri.endswith("imu.csv"):
             continue
-        folder = ROOT / Path(uri).parent
+        folder = EXAMPLES / Path(uri).parent
         frames, summary = read_log(folder, configuration.vehicle("damaged-counts"))
         assert frames["imu"].height == stated.get("rows", stated.get("whole_rows"))
         assert frames["vps"].height == 1464
         cut = "whole_rows" in stated
         assert [finding.code for finding in summary.findings] == (["unterminated_row"] if cut else [])
         whole, _ = read_log(
-            ROOT / "broad-imu-1-counts/2026-05-04-A1/broad_06", configuration.vehicle("broad-imu-1-counts")
+            EXAMPLES / "broad-imu-1-counts/2026-05-04-A1/broad_06", configuration.vehicle("broad-imu-1-counts")
         )
         for table in ("imu", "magnetometer", "vps"):
             assert frames[table].equals(whole[table].head(frames[table].height))
@@ -93,7 +93,7 @@ VERDICTS = {
 
 
 def test_damaged_recordings_get_the_verdicts_they_should(configuration: Configuration) -> None:
-    logs = [log for log in find_logs(ROOT) if log.vehicle_id.startswith("damaged")]
+    logs = [log for log in find_logs(EXAMPLES) if log.vehicle_id.startswith("damaged")]
     found = {}
     for log in logs:
         _, facts = read_flight(log.path, configuration.vehicle(log.vehicle_id))
@@ -103,7 +103,7 @@ def test_damaged_recordings_get_the_verdicts_they_should(configuration: Configur
 
 def test_sound_recordings_have_sane_sensors(configuration: Configuration) -> None:
     """No real recording is refused for what only a broken one shows."""
-    for log in find_logs(ROOT):
+    for log in find_logs(EXAMPLES):
         vehicle = configuration.vehicle(log.vehicle_id)
         tables, facts = read_flight(log.path, vehicle)
         if not tables:
@@ -115,7 +115,7 @@ def test_sound_recordings_have_sane_sensors(configuration: Configuration) -> Non
 
 
 def test_mcap_columns_are_what_mcap_ros2_decodes(configuration: Configuration) -> None:
-    path = ROOT / "broad-imu-1/2026-05-11-B/broad_02.mcap"
+    path = EXAMPLES / "broad-imu-1/2026-05-11-B/broad_02.mcap"
     frames, summary = read_log(path, configuration.vehicle("broad-imu-1"))
     poses = [
         (stamp_ns(m), *(getattr(m.pose.orientation, k) for k in "xyzw"), *(getattr(m.pose.position, k) for k in "xyz"))
@@ -131,7 +131,7 @@ def test_mcap_columns_are_what_mcap_ros2_decodes(configuration: Configuration) -
 
 
 def test_csv_columns_are_what_python_reads(configuration: Configuration) -> None:
-    folder = ROOT / "broad-imu-1-counts/2026-05-04-A1/broad_06"
+    folder = EXAMPLES / "broad-imu-1-counts/2026-05-04-A1/broad_06"
     frames, _ = read_log(folder, configuration.vehicle("broad-imu-1-counts"))
     with (folder / "vps.csv").open(newline="") as stream:
         rows = [list(row.values()) for row in csv.DictReader(stream)]

@@ -1,19 +1,18 @@
 """Real recordings with motion capture: clocks, gyroscope constants and refusals against their published references.
 
-Needs `FIELDCAL_EXAMPLE_LOGS`: a folder with the recordings, their fieldcal.toml and expected.json.
+Needs `FIELDCAL_EXAMPLE_LOGS` (`example_logs`): the recordings, their fieldcal.toml and expected.json.
 """
 
 from __future__ import annotations
 
 import json
-import os
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
+from example_logs import EXAMPLES, needs_examples
 
 from fieldcal.config.configuration import load
 from fieldcal.config.flight_settings import flight_settings
@@ -22,8 +21,7 @@ from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import AXES
 
-FOLDER = Path(os.environ.get("FIELDCAL_EXAMPLE_LOGS", "/nonexistent"))
-pytestmark = pytest.mark.skipif(not (FOLDER / "expected.json").exists(), reason="FIELDCAL_EXAMPLE_LOGS is not set")
+pytestmark = needs_examples
 
 MILLISECOND = 1e-3
 SLOW_SCALE, SLOW_BIAS_DEG_S = 0.015, 0.1
@@ -36,13 +34,13 @@ WITH_VPS = [f"{SESSION}/broad_{n}.mcap" for n in ("02", "07", "11", "28")] + [
 
 @cache
 def expected() -> dict[str, Any]:
-    return dict(json.loads((FOLDER / "expected.json").read_text()))
+    return dict(json.loads((EXAMPLES / "expected.json").read_text()))
 
 
 @cache
 def calibrated(log_uri: str) -> dict[str, StageResult]:
-    log = next(log for log in find_logs(FOLDER) if log.log_uri == log_uri)
-    vehicle = load(FOLDER / "fieldcal.toml").vehicle(log.vehicle_id)
+    log = next(log for log in find_logs(EXAMPLES) if log.log_uri == log_uri)
+    vehicle = load(EXAMPLES / "fieldcal.toml").vehicle(log.vehicle_id)
     signals, summary = read_log(log.path, vehicle)
     signals = {name: frame.unique("t_ns", keep="first").sort("t_ns") for name, frame in signals.items()}
     declared = {"world": summary.world, "body": summary.body, "gravity_sign": summary.gravity_sign}

@@ -1,4 +1,4 @@
-"""The README's five questions: both forms of each are run, and say the same."""
+"""The documentation's five questions: both forms of each are run, and say the same."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse import Warehouse
 
-README = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs/how-to/ask-the-history.md").read_text(encoding="utf-8")
 QUESTION = re.compile(r"<!-- question -->\n\*\*(.+?)\*\*\n\n```sql\n(.+?)```\n\n```python\n(.+?)```", re.DOTALL)
-QUESTIONS = QUESTION.findall(README)
+QUESTIONS = QUESTION.findall(PAGE)
 
 
 @pytest.fixture(scope="module")
 def warehouse(tmp_path_factory: pytest.TempPathFactory, prefect_server: str) -> Warehouse:
     """A fleet whose flights differ in temperature; one log has no VPS, one is empty."""
-    folder = tmp_path_factory.mktemp("readme")
+    folder = tmp_path_factory.mktemp("questions")
     for session, temperature in enumerate((5.0, 20.0, 35.0)):
         experiment = Experiment(
             seed=session,
@@ -44,7 +44,7 @@ def warehouse(tmp_path_factory: pytest.TempPathFactory, prefect_server: str) -> 
 
 
 def test_there_are_five() -> None:
-    assert len(QUESTIONS) == README.count("<!-- question -->") == 5
+    assert len(QUESTIONS) == PAGE.count("<!-- question -->") == 5
 
 
 @pytest.mark.parametrize(("question", "sql", "python"), QUESTIONS, ids=[question[0] for question in QUESTIONS])

@@ -1,0 +1,108 @@
+"""Reference pages that are written from the code at every build: tables, command line, conventions, parameters."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+import fieldcal
+from fieldcal import errors
+from fieldcal.cli.main import app as command_line
+from fieldcal.config.parameters import PARAMETERS, PROFILES, Parameter
+from fieldcal.schemas.dictionary import data_dictionary
+
+FOLDER = "reference/generated"
+
+
+def tables() -> str:
+    """The data dictionary, from the schemas."""
+    title, _, rest = data_dictionary().partition("\n")
+    about = (
+        "Written from `fieldcal.schemas`, as is `python -m fieldcal.schemas`. A star marks the columns that identify a "
+        'row; a unit of "1" says dimensionless. A table\'s version grows with every change of its columns.'
+    )
+    return f"{title}\n\n{about}\n{rest}"
+
+
+def commands() -> str:
+    """Every command and option, from the command line itself."""
+    text = str(command_line.generate_docs(output_format="markdown"))
+    text = re.sub(r"## Table of Contents.*?(?=\*\*Commands\*\*)", "", text, flags=re.DOTALL)
+    # cyclopts takes the program that is running for part of the usage.
+    text = re.sub(r"^(fieldcal [\w-]+) (?:-m )?[\w-]*sphinx[\w-]*(?= )", r"\1", text, flags=re.MULTILINE)
+    return re.sub(r"\A# .*\n", "# Command line\n", text)
+
+
+def conventions() -> str:
+    """The page that fixes the conventions: the package's own docstring."""
+    return f"# Conventions\n\nThis is the docstring of `fieldcal`.\n\n```text\n{fieldcal.__doc__}```\n"
+
+
+def parameters() -> str:
+    """Every parameter of the stages, and the profiles."""
+    lines = ["# Parameters of the stages", ""]
+    lines += ["In `[defaults.parameters]` or a vehicle's `parameters`, or for one log `--set name=value`.", ""]
+    lines += ["| parameter | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
+    for name, p in PARAMETERS.items():
+        lines.append(f"| `{name}` | {_toml(p.default)} | {p.unit} | {_allowed(p)} | {p.meaning} |")
+    lines += ["", "## Profiles", "", "What a profile sets; the configuration's own parameters win over it.", ""]
+    for name, changes in PROFILES.items():
+        what = ", ".join(f"`{key} = {_toml(value)}`" for key, value in changes.items()) or "the defaults above"
+        lines.append(f"- `{name}`: {what}")
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: object) -> str:
+    return json.dumps(value)
+
+
+def _allowed(p: Parameter) -> str:
+    if p.choices:
+        return ", ".join(f"`{choice}`" for choice in p.choices)
+    return f"{p.bounds[0]:g} … {p.bounds[1]:g}" if p.bounds else "`true`, `false`"
+
+
+def python() -> str:
+    """The public names of the package, its warehouse and its errors."""
+    names = [name for name in getattr(fieldcal, "__all__", ()) if not name.startswith("_")]
+    blocks = [_entry(f"fieldcal.{name}", _directive(getattr(fieldcal, name))) for name in names]
+    rooms = ("fieldcal.warehouse.query", "fieldcal.logs", "fieldcal.logs.interface", errors.__name__)
+    return "# Python\n\n" + "\n".join(blocks + [_entry(room, "automodule") for room in rooms])
+
+
+def _entry(name: str, directive: str) -> str:
+    members = "" if directive in ("autofunction", "autodata") else "   :members:\n"
+    return f"```{{eval-rst}}\n.. {directive}:: {name}\n{members}```\n"
+
+
+def _directive(public: object) -> str:
+    if isinstance(public, type):
+        return "autoexception" if issubclass(public, BaseException) else "autoclass"
+    return "autofunction" if callable(public) else "autodata"
+
+
+PAGES = {
+    "tables": tables,
+    "command-line": commands,
+    "conventions": conventions,
+    "parameters": parameters,
+    "python": python,
+}
+
+
+def write(app: Sphinx) -> None:
+    """Writes what has changed, so that a second build reads the rest from its cache."""
+    folder = Path(app.srcdir) / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, make in PAGES.items():
+        page, text = folder / f"{name}.md", make()
+        if not page.is_file() or page.read_text(encoding="utf-8") != text:
+            page.write_text(text, encoding="utf-8")
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    app.connect("builder-inited", write)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
