@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 from sphinx.application import Sphinx
 
 import fieldcal
 from fieldcal import errors
 from fieldcal.cli.main import app as command_line
-from fieldcal.config.parameters import PARAMETERS, PROFILES, Parameter
+from fieldcal.config.parameters import PROFILES, Parameters
 from fieldcal.schemas.dictionary import data_dictionary
 
 FOLDER = "reference/generated"
@@ -46,8 +47,9 @@ def parameters() -> str:
     lines = ["# Parameters of the stages", ""]
     lines += ["In `[defaults.parameters]` or a vehicle's `parameters`, or for one log `--set name=value`.", ""]
     lines += ["| parameter | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
-    for name, p in PARAMETERS.items():
-        lines.append(f"| `{name}` | {_toml(p.default)} | {p.unit} | {_allowed(p)} | {p.meaning} |")
+    for name, field in Parameters.model_json_schema()["properties"].items():
+        default, unit, meaning = _toml(field["default"]), field.get("unit", ""), field["description"]
+        lines.append(f"| `{name}` | {default} | {unit} | {_allowed(field)} | {meaning} |")
     lines += ["", "## Profiles", "", "What a profile sets; the configuration's own parameters win over it.", ""]
     for name, changes in PROFILES.items():
         what = ", ".join(f"`{key} = {_toml(value)}`" for key, value in changes.items()) or "the defaults above"
@@ -59,10 +61,10 @@ def _toml(value: object) -> str:
     return json.dumps(value)
 
 
-def _allowed(p: Parameter) -> str:
-    if p.choices:
-        return ", ".join(f"`{choice}`" for choice in p.choices)
-    return f"{p.bounds[0]:g} … {p.bounds[1]:g}" if p.bounds else "`true`, `false`"
+def _allowed(field: dict[str, Any]) -> str:
+    if "enum" in field:
+        return ", ".join(f"`{choice}`" for choice in field["enum"])
+    return f"{field['minimum']:g} … {field['maximum']:g}" if "minimum" in field else "`true`, `false`"
 
 
 def python() -> str:
