@@ -9,6 +9,7 @@ from numerics_support import ROUNDING
 
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.warm_up import SCALE_PER_DEGC_SD, fit_resting_accelerometer, fit_warm_up, rest_windows
+from fieldcal.names import Sensor
 from fieldcal.simulation.archive import settings, signals
 from fieldcal.simulation.experiment import SCALE, Experiment, simulate
 from fieldcal.stages.pipeline import run_flight
@@ -146,7 +147,8 @@ def test_the_stage_tells_of_a_resting_accelerometer() -> None:
         "temperature": pl.DataFrame({"t_ns": t_ns, "temperature_degc": warm}),
         "accelerometer": calibration_rows(known),
     }
-    s = {"units": {"gyroscope": "counts", "accelerometer": "m/s^2"}, "manoeuvre_max_gap_s": 0.1}
+    units = {Sensor.GYROSCOPE: "counts", Sensor.ACCELEROMETER: "m/s^2"}
+    s = WarmUpSettings(units=units, manoeuvre_max_gap_s=0.1)
     rows = find_warm_up(tables, s).tables["calibration"].filter(sensor="accelerometer")
     assert rows["unit"].unique().to_list() == ["(m/s^2)/degC"]
     assert np.abs((rows["value"].to_numpy() - ACCELEROMETER_SLOPE) / rows["sd"].to_numpy()).max() < 3.5

@@ -16,6 +16,8 @@ from numerics_support import Array, rms
 from fieldcal.config.configuration import load
 from fieldcal.estimation.warm_up import fit_warm_up
 from fieldcal.exports.calibration_at import constants_of
+from fieldcal.names import Sensor
+from fieldcal.stages.settings import WarmUpSettings
 from fieldcal.stages.warm_up import find_warm_up
 from fieldcal.trends.drift_table import drift_table, update_drift
 from fieldcal.trends.temperature_curve import Curve, about_reference, combined, of_sessions, together
@@ -156,9 +158,9 @@ def rested(seed: int, low: float) -> Any:
     t_ns = np.rint(1e9 * t).astype(np.int64)
     imu = pl.DataFrame({"t_ns": t_ns, **{f"gyroscope_{a}": logged[:, i] for i, a in enumerate("xyz")}})
     temperature = pl.DataFrame({"t_ns": t_ns, "temperature_degc": warm})
-    units = {"units": {"gyroscope": "counts"}, "manoeuvre_max_gap_s": 0.1}
-    assert load(None).vehicle("v").parameters["manoeuvre_max_gap_s"] == 0.1
-    return find_warm_up({"imu": imu, "temperature": temperature}, units)
+    s = WarmUpSettings(units={Sensor.GYROSCOPE: "counts"}, manoeuvre_max_gap_s=0.1)
+    assert load(None).vehicle("v").parameters.manoeuvre_max_gap_s == 0.1
+    return find_warm_up({"imu": imu, "temperature": temperature}, s)
 
 
 def test_the_history_holds_the_curve_and_the_vehicle_flies_with_it(tmp_path: Path) -> None:
