@@ -20,6 +20,7 @@ import numpy as np
 
 from fieldcal.config.configuration import load
 from fieldcal.config.flight_settings import FlightSettings
+from fieldcal.config.stage_settings import Axes, taken_from
 from fieldcal.estimation.gyroscope.output_error import propagate_stretches, start_stretches
 from fieldcal.geometry.rotation import angle_between, slerp
 from fieldcal.logs import ingest
@@ -27,7 +28,6 @@ from fieldcal.names import Sensor
 from fieldcal.stages.attitude import sensor_attitude
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
-from fieldcal.stages.settings import Axes, taken_from
 from fieldcal.stages.tables import AXES, QUATERNION, matrix, seconds, triad
 from fieldcal.stages.vps import bridged
 

@@ -18,6 +18,7 @@ from fieldcal.batch.reasons import NO_RESULT, why_it_runs
 from fieldcal.batch.sources import sources
 from fieldcal.config.configuration import Vehicle
 from fieldcal.config.flight_settings import FlightSettings
+from fieldcal.config.stage_settings import as_json, taken_from
 from fieldcal.errors import UnreadableLog, unforeseen
 from fieldcal.flight.job import Job, file_stamp
 from fieldcal.flight.versions import versions
@@ -26,7 +27,6 @@ from fieldcal.logs.tidy import Disordered
 from fieldcal.stages.pipeline import INGEST, PIPELINE, Stage, run_stage
 from fieldcal.stages.results import StageResult, plain
 from fieldcal.stages.run_key import run_key
-from fieldcal.stages.settings import as_json, taken_from
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.files import file_sha256
 from fieldcal.warehouse.layout import signal_path

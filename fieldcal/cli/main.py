@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 import fieldcal
+from fieldcal.cli.config import config_app
 from fieldcal.cli.drift import drift
 from fieldcal.cli.fly import apply, export
 from fieldcal.cli.interrupt import interruptible
@@ -369,6 +370,7 @@ def _assignments(texts: list[str]) -> dict[str, str]:
     return {name.strip(): value.strip() for name, _, value in pairs}
 
 
+app.command(config_app)
 app.command(report_command, name="report")
 app.command(serve)
 app.command(trigger)

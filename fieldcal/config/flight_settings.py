@@ -1,6 +1,6 @@
 """What is known of a flight before any stage runs: configuration over the log's own word over the paper's defaults.
 
-Each stage takes the part that it names (`fieldcal.stages.settings`), and only that enters its run key.
+Each stage takes the part that it names (`fieldcal.config.stage_settings`), and only that enters its run key.
 """
 
 from __future__ import annotations

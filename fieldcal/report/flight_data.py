@@ -9,13 +9,13 @@ from typing import Any
 
 import polars as pl
 
+from fieldcal.config.stage_settings import Axes, Differentiation, Gravity, LocalField, as_json, from_json, taken_from
 from fieldcal.errors import FieldcalError
 from fieldcal.flight.calibrate import CalibratedLog
 from fieldcal.flight.rows import rows_frame
 from fieldcal.names import InitialAttitude
 from fieldcal.schemas import SIGNAL_TABLES, SchemaMismatch
 from fieldcal.stages.pipeline import PIPELINE
-from fieldcal.stages.settings import Axes, Differentiation, Gravity, LocalField, as_json, from_json, taken_from
 from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.stage_store import StageStore

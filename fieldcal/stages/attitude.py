@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import polars as pl
 
+from fieldcal.config.stage_settings import AttitudeSettings, Axes, BodyVectors, LoggedValues, VectorConstants
 from fieldcal.estimation import wahba
 from fieldcal.estimation.faults import Fault
 from fieldcal.geometry import sensor_model
@@ -14,7 +15,6 @@ from fieldcal.geometry.rotation import Array, from_matrix, multiply
 from fieldcal.names import VECTOR_SENSORS, Sensor
 from fieldcal.stages.inputs import Tables, spread_of
 from fieldcal.stages.results import StageResult, fault_rows
-from fieldcal.stages.settings import AttitudeSettings, Axes, BodyVectors, LoggedValues, VectorConstants
 from fieldcal.stages.tables import QUATERNION, columns_of, constants, matrix, triad
 
 # Trust in an attitude halves where the sensed length is off by this share of the field.

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from fieldcal.config.stage_settings import Axes, SmoothingSettings, VerifySettings
 from fieldcal.estimation import smoothing, wahba
 from fieldcal.estimation.gyroscope.equation_error import predicted_quaternion_rate
 from fieldcal.estimation.gyroscope.output_error import propagate_stretches, shooting_segments, start_stretches
@@ -18,7 +19,6 @@ from fieldcal.geometry.rotation import Array, continuous, slerp
 from fieldcal.stages.attitude import body_vectors, known_vectors, sensor_attitude
 from fieldcal.stages.inputs import Tables, differentiate_by_segment, spread_of
 from fieldcal.stages.results import StageResult
-from fieldcal.stages.settings import Axes, SmoothingSettings, VerifySettings
 from fieldcal.stages.tables import QUATERNION, constants, matrix, seconds, triad
 from fieldcal.stages.vps import BRIDGE_S, RATE_COLUMNS, bridged, interpolate_attitude
 

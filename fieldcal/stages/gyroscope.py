@@ -8,6 +8,14 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from fieldcal.config.stage_settings import (
+    GyroEquationPass2Settings,
+    GyroEquationSettings,
+    GyroOutputSettings,
+    GyroSettings,
+    LoggedValues,
+    TriadUncertainty,
+)
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation.gyroscope import equation_error, output_error
 from fieldcal.estimation.gyroscope.equation_error import GyroFit
@@ -27,14 +35,6 @@ from fieldcal.stages.inputs import (
     spread_of,
 )
 from fieldcal.stages.results import StageResult, triad_rows
-from fieldcal.stages.settings import (
-    GyroEquationPass2Settings,
-    GyroEquationSettings,
-    GyroOutputSettings,
-    GyroSettings,
-    LoggedValues,
-    TriadUncertainty,
-)
 from fieldcal.stages.tables import (
     AXES,
     QUATERNION,

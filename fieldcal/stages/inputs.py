@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from fieldcal.config.stage_settings import ReferenceReading
 from fieldcal.estimation import smoothing
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.statistics import robust_sigma
@@ -15,7 +16,6 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.geometry.sensor_model import default_reference_reading
 from fieldcal.names import Sensor
 from fieldcal.stages.results import StageResult, fatal_fault
-from fieldcal.stages.settings import ReferenceReading
 
 Tables = Mapping[str, pl.DataFrame]
 

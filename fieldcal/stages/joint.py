@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from fieldcal.config.stage_settings import JointSettings
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation.joint import initialise, model_selection
 from fieldcal.estimation.joint.covariance import advice
@@ -22,7 +23,6 @@ from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Tables, is_sound, mean_temperature, reference_reading, refusal
 from fieldcal.stages.joint_reference import Poses, poses_of, with_poses
 from fieldcal.stages.results import StageResult, fatal_fault, triad_rows, zero_slope_rows
-from fieldcal.stages.settings import JointSettings
 from fieldcal.stages.tables import (
     AXES,
     QUATERNION,

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fieldcal.config.stage_settings import VpsReference
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation.clock_sync import by_rates
 from fieldcal.estimation.joint.fit import JointFit, fit_joint
@@ -15,7 +16,6 @@ from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, continuous, to_rotation_vector
 from fieldcal.stages.attitude import sensor_attitude
 from fieldcal.stages.inputs import Tables
-from fieldcal.stages.settings import VpsReference
 from fieldcal.stages.tables import QUATERNION, matrix, seconds
 from fieldcal.stages.vps import vps_attitude
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from fieldcal.config.stage_settings import VectorsSettings
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation import ellipsoid, motor_field
 from fieldcal.estimation.faults import Fault
@@ -17,7 +18,6 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import Sensor
 from fieldcal.stages.inputs import Tables, in_used_segments
 from fieldcal.stages.results import fatal_fault
-from fieldcal.stages.settings import VectorsSettings
 from fieldcal.stages.tables import constants, matrix, triad
 
 PAUSE_S = 1.0

@@ -13,12 +13,7 @@ from typing import Any
 import polars as pl
 
 from fieldcal.config.flight_settings import FlightSettings
-from fieldcal.names import VECTOR_SENSORS, Sensor
-from fieldcal.schemas import SchemaMismatch, conform
-from fieldcal.stages import attitude, comparison, gyroscope, joint, preparation, sanity, vector_triads, vps, warm_up
-from fieldcal.stages.inputs import Tables
-from fieldcal.stages.results import StageResult, fatal_fault
-from fieldcal.stages.settings import (
+from fieldcal.config.stage_settings import (
     AccelerometerSettings,
     AttitudeSettings,
     GatedAccelerometerSettings,
@@ -39,6 +34,11 @@ from fieldcal.stages.settings import (
     names_of,
     taken_from,
 )
+from fieldcal.names import VECTOR_SENSORS, Sensor
+from fieldcal.schemas import SchemaMismatch, conform
+from fieldcal.stages import attitude, comparison, gyroscope, joint, preparation, sanity, vector_triads, vps, warm_up
+from fieldcal.stages.inputs import Tables
+from fieldcal.stages.results import StageResult, fatal_fault
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from fieldcal.config.stage_settings import ManoeuvreSettings, SmoothingSettings
 from fieldcal.estimation import motion_selection, smoothing
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.results import StageResult
-from fieldcal.stages.settings import ManoeuvreSettings, SmoothingSettings
 from fieldcal.stages.tables import columns_of, matrix, seconds, triad
 
 SHORTEST_STRETCH = 10

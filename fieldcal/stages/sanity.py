@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fieldcal.config.stage_settings import SanitySettings
 from fieldcal.estimation import faults
 from fieldcal.estimation.faults import Fault
 from fieldcal.geometry.earth_field import UNIT_IN_TESLA
@@ -11,7 +12,6 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import Sensor
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.results import StageResult, fault_rows
-from fieldcal.stages.settings import SanitySettings
 from fieldcal.stages.tables import matrix, seconds, triad
 
 TABLE_OF = {Sensor.GYROSCOPE: "imu", Sensor.ACCELEROMETER: "imu", Sensor.MAGNETOMETER: "magnetometer"}

@@ -8,6 +8,13 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from fieldcal.config.stage_settings import (
+    AccelerometerSettings,
+    EllipsoidSettings,
+    GatedAccelerometerSettings,
+    MagnetometerSettings,
+    VectorsSettings,
+)
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation import ellipsoid, motion_selection
 from fieldcal.estimation.ellipsoid import TriadFit
@@ -25,13 +32,6 @@ from fieldcal.stages.inputs import (
 )
 from fieldcal.stages.motor_field import check_motor_field
 from fieldcal.stages.results import StageResult, fatal_fault, fault_rows, triad_rows
-from fieldcal.stages.settings import (
-    AccelerometerSettings,
-    EllipsoidSettings,
-    GatedAccelerometerSettings,
-    MagnetometerSettings,
-    VectorsSettings,
-)
 from fieldcal.stages.tables import calibration_rows, constants, covariance_table, matrix, seconds, triad
 
 ELLIPSOID_METHOD = {

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from fieldcal.config.stage_settings import LoggedValues, VpsAttitude, VpsClock, VpsSyncSettings
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation import smoothing
 from fieldcal.estimation.clock_sync import by_rates
@@ -31,7 +32,6 @@ from fieldcal.names import Sensor
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Tables, is_sound
 from fieldcal.stages.results import StageResult
-from fieldcal.stages.settings import LoggedValues, VpsAttitude, VpsClock, VpsSyncSettings
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, constants, matrix, seconds, triad
 
 BRIDGE_S = 0.1  # IMU results are interpolated to VPS stamps only between samples this close

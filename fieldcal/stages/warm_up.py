@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from fieldcal.config.stage_settings import WarmUpSettings
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation import warm_up
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Sensor
 from fieldcal.stages.inputs import Tables, is_sound
 from fieldcal.stages.results import ZERO_SLOPE, StageResult, zero_slope_rows
-from fieldcal.stages.settings import WarmUpSettings
 from fieldcal.stages.tables import calibration_rows, constants, matrix, seconds, triad
 
 METHOD, PARAMETER = "warm_up", ZERO_SLOPE

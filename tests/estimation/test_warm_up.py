@@ -7,6 +7,7 @@ import polars as pl
 import pytest
 from numerics_support import ROUNDING
 
+from fieldcal.config.stage_settings import WarmUpSettings, taken_from
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.warm_up import SCALE_PER_DEGC_SD, fit_resting_accelerometer, fit_warm_up, rest_windows
 from fieldcal.names import Sensor
@@ -14,7 +15,6 @@ from fieldcal.simulation.archive import settings, signals
 from fieldcal.simulation.experiment import SCALE, Experiment, simulate
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import triad_rows
-from fieldcal.stages.settings import WarmUpSettings, taken_from
 from fieldcal.stages.tables import calibration_rows
 from fieldcal.stages.warm_up import find_warm_up
 

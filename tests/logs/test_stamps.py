@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_tidy import Reader, counts, imu, rows
 
+from fieldcal.config.stage_settings import ManoeuvreSettings, SmoothingSettings, taken_from
 from fieldcal.logs import Columns, stamps
 from fieldcal.logs.ingest import TidyLog
 from fieldcal.logs.tidy import Disordered, TidySignal
@@ -19,7 +20,6 @@ from fieldcal.simulation.archive import settings as simulated_settings
 from fieldcal.simulation.archive import signals
 from fieldcal.simulation.experiment import simulate
 from fieldcal.stages.preparation import find_manoeuvre, smooth
-from fieldcal.stages.settings import ManoeuvreSettings, SmoothingSettings, taken_from
 from fieldcal.stages.tables import matrix, triad
 
 STEP_NS = 5_000_000

@@ -15,6 +15,7 @@ from serial_accuracy import study
 from fieldcal.config.configuration import load, parse
 from fieldcal.config.flight_settings import flight_settings
 from fieldcal.config.parameters import PROFILES
+from fieldcal.config.stage_settings import as_json, from_json, taken_from
 from fieldcal.geometry.frames import FRD_FROM_FLU, FRD_FROM_FLU_QUATERNION, NED_FROM_ENU_QUATERNION
 from fieldcal.geometry.rotation import (
     angle_between,
@@ -28,7 +29,6 @@ from fieldcal.simulation.archive import settings, signals, truth, write_flights
 from fieldcal.simulation.experiment import Experiment, Recording, simulate
 from fieldcal.stages.pipeline import PIPELINE, run_flight
 from fieldcal.stages.results import StageResult
-from fieldcal.stages.settings import as_json, from_json, taken_from
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, matrix, triad
 
 VECTOR_EXACT, GYRO_EXACT = 1e-6, 1e-3
