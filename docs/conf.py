@@ -21,6 +21,7 @@ extensions = [
     "offline_math",
 ]
 exclude_patterns = ["_build", "_build_tools"]
+suppress_warnings = ["ref.python"]  # a public name has two places: fieldcal.X, and the module that defines it
 default_role = "literal"  # docstrings write `name` for code
 
 myst_enable_extensions = ["amsmath", "dollarmath", "deflist", "colon_fence"]
@@ -36,6 +37,7 @@ autodoc_typehints = "signature"
 autodoc_type_aliases = {"Array": "Array", "ArrayLike": "ArrayLike"}
 python_use_unqualified_type_names = True
 napoleon_google_docstring = False
+napoleon_use_ivar = True
 napoleon_use_rtype = False
 
 html_theme = "furo"

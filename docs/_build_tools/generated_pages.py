@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from sphinx.application import Sphinx
 
 import fieldcal
-from fieldcal import errors
+import fieldcal.errors
+import fieldcal.logs
+import fieldcal.logs.interface
+import fieldcal.warehouse.query
 from fieldcal.cli.main import app as command_line
 from fieldcal.config.parameters import PROFILES, Parameters
 from fieldcal.schemas.dictionary import data_dictionary
@@ -71,13 +75,16 @@ def python() -> str:
     """The public names of the package, its warehouse and its errors."""
     names = [name for name in getattr(fieldcal, "__all__", ()) if not name.startswith("_")]
     blocks = [_entry(f"fieldcal.{name}", _directive(getattr(fieldcal, name))) for name in names]
-    rooms = ("fieldcal.warehouse.query", "fieldcal.logs", "fieldcal.logs.interface", errors.__name__)
-    return "# Python\n\n" + "\n".join(blocks + [_entry(room, "automodule") for room in rooms])
+    rooms = (fieldcal.warehouse.query, fieldcal.logs, fieldcal.logs.interface, fieldcal.errors)
+    blocks += [_entry(room.__name__, "automodule", [name for name in names if hasattr(room, name)]) for room in rooms]
+    return "# Python\n\n" + "\n".join(blocks)
 
 
-def _entry(name: str, directive: str) -> str:
-    members = "" if directive in ("autofunction", "autodata") else "   :members:\n"
-    return f"```{{eval-rst}}\n.. {directive}:: {name}\n{members}```\n"
+def _entry(name: str, directive: str, told_above: Sequence[str] = ()) -> str:
+    options = "" if directive in ("autofunction", "autodata") else "   :members:\n"
+    if told_above:
+        options += f"   :exclude-members: {', '.join(told_above)}\n"
+    return f"```{{eval-rst}}\n.. {directive}:: {name}\n{options}```\n"
 
 
 def _directive(public: object) -> str:
