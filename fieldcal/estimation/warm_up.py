@@ -188,8 +188,8 @@ def fit_resting_accelerometer(
     x = np.column_stack([np.ones(len(warm)), warm - centre])
     fits = [_robust(x, means[:, 3 + axis]) for axis in range(3)]
     zero, slope = np.stack([beta for beta, _ in fits]).T
-    own = np.array([covariance[1, 1] for _, covariance in fits])
-    sd = np.sqrt(own + (SCALE_PER_DEGC_SD * means[:, 6:].mean(axis=0)) ** 2)
+    variance = np.array([covariance[1, 1] for _, covariance in fits])
+    sd = np.sqrt(variance + (SCALE_PER_DEGC_SD * means[:, 6:].mean(axis=0)) ** 2)
     return WarmUp(slope, sd, zero, centre, len(middles), span, float(np.abs(x[:, 1]).max()), None, None)
 
 

@@ -74,7 +74,7 @@ def estimate_jointly(tables: Tables, s: JointSettings) -> StageResult:
     return replace(
         result,
         tables={**result.tables, **_held_out(fit, readings, tables, s, arm, poses)},
-        measured={**result.measured, **by_vps, "terms": model_selection.told(tests, fit)},
+        measured={**result.measured, **by_vps, "terms": model_selection.summary(tests, fit)},
     )
 
 
@@ -295,7 +295,7 @@ def axis_noise_share(fit: JointFit) -> Array:
 def misfit(fit: JointFit, name: str) -> float:
     """Rms of what a vector triad reads beside the field or gravity, over their length: its residual (robust level) and,
     for the accelerometer, the translation, which stands in the model but says nothing of a scale."""
-    row = 3 * fit.model.rows.index(name)
+    row = 3 * fit.model.vectors.index(name)
     scale = fit.state.values[name][:3]
     square = np.sum(fit.levels.variance[row : row + 3] * scale**2)
     readings = fit.model.readings
@@ -307,10 +307,10 @@ def misfit(fit: JointFit, name: str) -> float:
 def passing_field_share(fit: JointFit) -> float:
     """Share of the magnetometer's readings left out as those of a passing field; 0 without one."""
     logged = fit.model.readings.magnetometer
-    if logged is None or "magnetometer" not in fit.model.rows:
+    if logged is None or "magnetometer" not in fit.model.vectors:
         return 0.0
     given = np.isfinite(logged[fit.model.at]).all(axis=1)
-    return float(1.0 - fit.model.triads["magnetometer"].known.sum() / given.sum())
+    return float(1.0 - fit.model.triads["magnetometer"].valid.sum() / given.sum())
 
 
 def _measured(fit: JointFit, axes: Array) -> dict[str, Any]:
@@ -324,10 +324,11 @@ def _measured(fit: JointFit, axes: Array) -> dict[str, Any]:
         "iterations": fit.iterations,
         "scale_relative_sd": relative,
         "mean_robust_weight": {
-            name: float(fit.weight[fit.model.triads[name].known, 3 * i].mean()) for i, name in enumerate(fit.model.rows)
+            name: float(fit.weight[fit.model.triads[name].valid, 3 * i].mean())
+            for i, name in enumerate(fit.model.vectors)
         },
         "passing_field_share": passing_field_share(fit),
-        "misfit": {name: misfit(fit, name) for name in fit.model.rows},
+        "misfit": {name: misfit(fit, name) for name in fit.model.vectors},
         "gyro_walk_deg_per_sqrt_s": float(np.degrees(np.sqrt(fit.levels.walk))),
         "gyro_bias_walk_radps_per_sqrt_s": fit.bias_walk,
         "gyro_noise_share": gyro_noise_share(fit),

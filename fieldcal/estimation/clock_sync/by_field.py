@@ -63,21 +63,23 @@ def refine_by_field(
     -----
     The lag contains the sensors' group delay, taken to be the same for both unless they contradict each other.
     """
-    own = _clock(np.asarray(t, float), np.asarray(logged, float), np.asarray(t_vps, float), q_vps, fit, max_gap_s)
-    if own is None or own.disagreement > AGREEMENT:
-        return fit, own
-    gyro, field = np.linalg.inv(fit.covariance), np.linalg.inv(own.covariance)
+    by_field = _clock(np.asarray(t, float), np.asarray(logged, float), np.asarray(t_vps, float), q_vps, fit, max_gap_s)
+    if by_field is None or by_field.disagreement > AGREEMENT:
+        return fit, by_field
+    gyro, field = np.linalg.inv(fit.covariance), np.linalg.inv(by_field.covariance)
     covariance = np.linalg.inv(gyro + field)
-    lag, skewed = covariance @ (gyro @ [fit.lag_mid_s, 1e-6 * fit.skew_ppm] + field @ [own.lag_mid_s, own.skew])
-    return replace(fit, lag_mid_s=float(lag), skew_ppm=1e6 * float(skewed), covariance=covariance), own
+    lag, skewed = covariance @ (
+        gyro @ [fit.lag_mid_s, 1e-6 * fit.skew_ppm] + field @ [by_field.lag_mid_s, by_field.skew]
+    )
+    return replace(fit, lag_mid_s=float(lag), skew_ppm=1e6 * float(skewed), covariance=covariance), by_field
 
 
 def _clock(
     t: Array, logged: Array, t_vps: Array, q_vps: ArrayLike, fit: SyncFit, max_gap_s: float
 ) -> FieldClock | None:
     """Gauss–Newton on lag and skew, the linear coefficients eliminated at every step."""
-    known = np.isfinite(logged).all(axis=1)
-    t, logged = t[known], logged[known]
+    valid = np.isfinite(logged).all(axis=1)
+    t, logged = t[valid], logged[valid]
     q = continuous(q_vps)
     rate = block_rates(t_vps, q, max_gap_s)
     lag, skewed = fit.lag_mid_s, 1e-6 * fit.skew_ppm

@@ -95,10 +95,10 @@ def fit_equation_error(
         # ω̂ = 2Ξᵀq̇ on (ω_d, 1): one small regression an axis
         target = body_rate(q, q_dot)
         for i in range(3):
-            own = np.ix_([i, 3 + i], [i, 3 + i])
+            pair_of_axis = np.ix_([i, 3 + i], [i, 3 + i])
             sensitivity = np.stack([x[:, i], np.ones(n)], axis=1)
             pair = _robust_solve(sensitivity, target[:, i], trust, robust=robust, share=float(share[i]))
-            theta[[i, 3 + i]], residual, white[own], coloured[own] = pair
+            theta[[i, 3 + i]], residual, white[pair_of_axis], coloured[pair_of_axis] = pair
             coloured[i, i] += (NOISE_DENSITY_SD * share[i] * theta[i]) ** 2
             squares += float(residual @ residual)
     elif equations == "scalar":

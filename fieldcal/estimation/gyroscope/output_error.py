@@ -90,9 +90,9 @@ def random_walk(t: Array, residual: Array, stretch: np.ndarray, weight: Array) -
         count = length // size
         if count <= apart:
             continue
-        own = slice(start, start + count * size)
-        w = weight[own].reshape(count, size, 1)
-        mean = np.sum(residual[own].reshape(count, size, 3) * w, axis=1) / np.maximum(w.sum(axis=1), 1e-300)
+        samples = slice(start, start + count * size)
+        w = weight[samples].reshape(count, size, 1)
+        mean = np.sum(residual[samples].reshape(count, size, 3) * w, axis=1) / np.maximum(w.sum(axis=1), 1e-300)
         near.append((mean[1:] - mean[:-1]) ** 2)
         far.append((mean[apart:] - mean[:-apart]) ** 2)
     if not near:

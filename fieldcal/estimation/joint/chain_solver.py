@@ -1,11 +1,12 @@
 """The attitude and motion of a whole record as one chain of knots: its process noise and its normal equations.
 
-Multiple shooting with soft joints. Between neighbouring knots the gyroscope is integrated; where one interval ends and
-the next begins the attitude may jump by what gyroscope noise makes of the interval. Beside the attitude a knot carries
-the translation that the accelerometer senses: velocity, acceleration and jerk of a velocity that is white noise behind
-three equal low-passes, so that the acceleration has no constant part, as that of a vehicle that stays in sight. All
-knots are eliminated from the normal equations by block cyclic reduction (the Schur complement), in time linear in the
-record's length.
+This is a smoother over a whole record (fixed-interval smoothing), written as least squares on its states: multiple
+shooting with soft joints. Between neighbouring knots the gyroscope is integrated; where one interval ends and the next
+begins the attitude may jump, by the process noise that gyroscope noise accumulates over the interval. Beside the
+attitude a knot carries the translation that the accelerometer senses: velocity, acceleration and jerk, driven by white
+noise behind three equal low-passes, so that the acceleration has no constant part, like that of a vehicle that stays
+near one place. All knots are eliminated from the normal equations by block cyclic reduction (the Schur complement), in
+time linear in the record's length.
 """
 
 from __future__ import annotations
@@ -20,22 +21,27 @@ from fieldcal.errors import EstimationError
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.geometry.rotation import Array
 
-# Where the acceleration has most power; a tenth of it is left at a quarter and at four times this frequency.
+# Peak of the acceleration's spectral density; at a quarter and at four times this frequency a tenth of it remains.
 MOTION_HZ = 0.7
-ORDER = 3  # velocity, acceleration, jerk, scaled to m/s²
-STATES = 3 + 3 * ORDER  # attitude error first
-# Right-hand sides after the parameters: the gradient, and what the unknowns make of each group's probe.
+ORDER = 3  # of the translation's process: velocity, acceleration, jerk, all scaled to m/s²
+# Of a knot: attitude error, rad, inertial axes; velocity, acceleration and jerk of the translation, three axes each.
+STATES = 3 + 3 * ORDER
+# Right-hand sides after the columns of the parameters: the gradient, then one for each group of residuals whose noise
+# level is estimated, for its probe (`Probe`): sensor rows, attitude jumps, translation, gyroscope noise within
+# intervals.
 GRADIENT, SENSORS, JUMP, MOTION, BRIDGE = RIGHTS = range(5)
-RUN = 128  # knots eliminated at a time
-WEAK = 1e-2  # 1/rad²: keeps directions that nothing observes (heading without a magnetometer) from being singular
+KNOTS_AT_ONCE = 128  # eliminated together: what a processor's cache holds
+# Information on each knot's attitude error: keeps directions that nothing observes (heading without a magnetometer)
+# from being singular.
+ATTITUDE_PRIOR_PER_RAD2 = 1e-2
 
 
 @dataclass(frozen=True)
 class Knots:
-    """Where the chain is tied: `index` (K,) sample of each knot; `of_sample` (n,) the knot at or before each sample;
-    `share` (n,) of the interval gone by there; `joined` (K−1,) whether neighbours belong to one contiguous segment;
-    `interval_s` (K−1,) between them (1 where not joined); `sample_s` between samples, median; `motion` the
-    translation's process per interval."""
+    """Where the knots are: `index` (K,) sample of each knot; `of_sample` (n,) the knot at or before each sample;
+    `share` (n,) of the interval that has passed there; `joined` (K−1,) whether neighbours belong to one contiguous
+    segment; `interval_s` (K−1,) between them (1 where not joined); `sample_s` between samples, median; `motion` the
+    translation's process over each interval."""
 
     index: np.ndarray
     of_sample: np.ndarray
@@ -50,16 +56,16 @@ class Knots:
 class Motion:
     """y_{k+1} = F y_k + noise for y = (ω0 v, a, j/ω0) of an axis, stationary covariance P with P_aa = 1.
 
-    `whitener` (K−1, 3, 3) is L⁻¹ with LLᵀ = P − FPFᵀ; `carried` (K−1, 3, 3) is L⁻¹F; `settled` (3, 3) L⁻¹ with
-    LLᵀ = P."""
+    `whitener` (K−1, 3, 3) is L⁻¹ with LLᵀ = P − FPFᵀ, the covariance of the process noise; `whitened_transition`
+    (K−1, 3, 3) is L⁻¹F; `start_whitener` (3, 3) is L⁻¹ with LLᵀ = P, for the first knot of a segment."""
 
     whitener: Array
-    carried: Array
-    settled: Array
+    whitened_transition: Array
+    start_whitener: Array
 
 
 def place_knots(t: Array, segment: np.ndarray, spacing_s: float) -> Knots:
-    """Tie contiguous segments at equal parts of at most `spacing_s`, on samples, both ends included."""
+    """Knots on the samples that cut contiguous segments into equal parts of at most `spacing_s`, both ends included."""
     n = len(t)
     index = []
     for a, b in run_bounds(segment):
@@ -82,12 +88,12 @@ def _motion(interval_s: Array) -> Motion:
     rate = omega * np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, -3.0, -3.0]])
     stationary = solve_continuous_lyapunov(rate, -np.diag([0.0, 0.0, 1.0]))
     stationary /= stationary[1, 1]
-    whitener, carried = np.empty((2, len(lengths), ORDER, ORDER))
+    whitener, transition = np.empty((2, len(lengths), ORDER, ORDER))
     for i, length in enumerate(lengths):
         f = expm(rate * length)
         whitener[i] = np.linalg.inv(np.linalg.cholesky(stationary - f @ stationary @ f.T))
-        carried[i] = whitener[i] @ f
-    return Motion(whitener[which], carried[which], np.linalg.inv(np.linalg.cholesky(stationary)))
+        transition[i] = whitener[i] @ f
+    return Motion(whitener[which], transition[which], np.linalg.inv(np.linalg.cholesky(stationary)))
 
 
 @dataclass
@@ -114,13 +120,13 @@ class Normal:
         )
 
     def eliminate(self) -> tuple[Array, Array, Array]:
-        """Knots eliminated (`chain_solve`): N_xx⁻¹ right (K, s, c), information of θ (p, p) (the Schur
-        complement N_θθ − N_θx N_xx⁻¹ N_xθ), gradients (p, c − p). Raises EstimationError `joint_singular`."""
+        """Eliminate the knots (`chain_solve`): N_xx⁻¹ right (K, s, c), information of θ (p, p) (the Schur complement
+        N_θθ − N_θx N_xx⁻¹ N_xθ), gradients (p, c − p). Raises EstimationError `joint_singular`."""
         p = len(self.parameters)
         eliminated = chain_solve(self.diagonal, self.below, self.right)
         flat, solved = (x.reshape(-1, x.shape[2]) for x in (self.right, eliminated))
-        taken = (flat.T @ solved)[:p]
-        information, gradient = self.parameters - taken[:, :p], self.parameters_right - taken[:, p:]
+        absorbed = (flat.T @ solved)[:p]
+        information, gradient = self.parameters - absorbed[:, :p], self.parameters_right - absorbed[:, p:]
         return eliminated, 0.5 * (information + information.T), gradient
 
 
@@ -132,27 +138,27 @@ def chain_solve(diagonal: Array, below: Array, right: Array) -> Array:
     `joint_singular`."""
     if len(diagonal) == 1:
         return np.asarray(_inverse(diagonal) @ right)
-    # An odd knot is below the even one before it, and the next even one below that.
+    # `before` couples an odd knot to the even one before it, `after` the next even one to that odd knot.
     odd, before, after = diagonal[1::2], below[0::2], below[1::2]
     even, rest, between = np.empty_like(diagonal[0::2]), np.empty_like(right[0::2]), np.empty_like(after)
-    even[0], rest[0] = diagonal[0], right[0]  # a run begins with the even knot that the one before it ended with
+    even[0], rest[0] = diagonal[0], right[0]  # a run begins with the even knot with which the run before it ended
     back, forth, solved = np.empty_like(before), np.empty_like(after), np.empty_like(right)
-    own = solved[1::2]
-    ends = [*range(0, len(odd), RUN), len(odd)]
+    odd_solved = solved[1::2]
+    ends = [*range(0, len(odd), KNOTS_AT_ONCE), len(odd)]
     runs = [(slice(a, b), slice(a + 1, b + 1)) for a, b in pairwise(ends)]
     for run, following in runs:
         inverse, up, down = _inverse(odd[run]), before[run].transpose(0, 2, 1), after[run]
-        back[run], own[run] = inverse @ before[run], inverse @ right[1::2][run]
+        back[run], odd_solved[run] = inverse @ before[run], inverse @ right[1::2][run]
         forth[run] = inverse[: len(down)] @ down.transpose(0, 2, 1)
         between[run] = -down @ back[run][: len(down)]
         even[following] = diagonal[0::2][following] - down @ forth[run]
-        rest[following] = right[0::2][following] - down @ own[run][: len(down)]
+        rest[following] = right[0::2][following] - down @ odd_solved[run][: len(down)]
         even[run] -= up @ back[run]
-        rest[run] -= up @ own[run]
+        rest[run] -= up @ odd_solved[run]
     solved[0::2] = chain_solve(even, between, rest)
     for run, following in runs:
-        own[run] -= back[run] @ solved[0::2][run]
-        own[run][: len(forth[run])] -= forth[run] @ solved[0::2][following]
+        odd_solved[run] -= back[run] @ solved[0::2][run]
+        odd_solved[run][: len(forth[run])] -= forth[run] @ solved[0::2][following]
     return solved
 
 
@@ -175,9 +181,10 @@ def solve_scaled(information: Array, gradient: Array) -> Array:
 
 @dataclass(frozen=True)
 class Joints:
-    """What ties neighbouring knots, linearised: `jump` (K−1, 3) rad, attitude of the next knot after the integrated
-    one, inertial axes; `moved` (K−1, 3, p) ∂(integrated attitude)/∂θ; `walk` gyroscope noise, rad²/s; `motion` (K, 9);
-    `strength` stationary rms of its acceleration, m/s² an axis."""
+    """The links between neighbouring knots, linearised: `jump` (K−1, 3) rad, from the integrated attitude to the next
+    knot's, inertial axes; `moved` (K−1, 3, p) ∂(integrated attitude)/∂θ; `walk` density of the attitude's random walk
+    by gyroscope noise, rad²/s; `motion` (K, 9) translation; `strength` stationary rms of its acceleration, m/s² an
+    axis."""
 
     jump: Array
     moved: Array
@@ -193,7 +200,7 @@ def add_joints(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> No
     eye = np.eye(3) * weight[:, None, None]
     normal.diagonal[:-1, :3, :3] += eye
     normal.diagonal[1:, :3, :3] += eye
-    normal.diagonal[:, range(3), range(3)] += WEAK
+    normal.diagonal[:, range(3), range(3)] += ATTITUDE_PRIOR_PER_RAD2
     normal.below[:, :3, :3] -= eye
     coupling = joints.moved * weight[:, None, None]
     rights = np.zeros((len(weight), 3, normal.right.shape[2] - p))
@@ -209,10 +216,11 @@ def add_joints(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> No
 
 
 def _process(knots: Knots, strength: float) -> tuple[Array, Array, Array]:
-    """Whitened process: (K−1, 3, 3) on the next knot, (K−1, 3, 3) on this one, (K, 3, 3) on a segment's first."""
+    """The translation's process over its sd: its factors of the next knot (K−1, 3, 3), of this knot (K−1, 3, 3) and of
+    the first knot of a segment (K, 3, 3)."""
     on = (knots.joined / strength)[:, None, None]
     first = (np.r_[True, ~knots.joined] / strength)[:, None, None]
-    return knots.motion.whitener * on, knots.motion.carried * on, knots.motion.settled * first
+    return knots.motion.whitener * on, knots.motion.whitened_transition * on, knots.motion.start_whitener * first
 
 
 def _add_motion(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> None:
@@ -226,8 +234,8 @@ def _add_motion(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> N
         (normal.diagonal, begin @ first),
     ):
         for axis in range(3):
-            own = slice(3 + axis, STATES, 3)
-            into[:, own, own] += block
+            of_axis = slice(3 + axis, STATES, 3)
+            into[:, of_axis, of_axis] += block
     y = joints.motion.reshape(-1, ORDER, 3)
     drawn = (probe.motion * knots.joined[:, None, None], probe.start)
     for column, (step, start) in ((GRADIENT, (behind @ y[:-1] - ahead @ y[1:], -(first @ y))), (MOTION, drawn)):
@@ -238,14 +246,14 @@ def _add_motion(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> N
 
 
 def whitened_joints(knots: Knots, joints: Joints) -> Array:
-    """Each interval's attitude jump and the translation's process noise in it, over their sd, (K−1, 3 + 9)."""
+    """Attitude jump and process noise of the translation over each interval, over their sd, (K−1, 3 + 9)."""
     jump = joints.jump * np.sqrt(knots.joined / (joints.walk * knots.interval_s))[:, None]
     return np.hstack([jump, whitened_motion(knots, joints.strength, joints.motion)[1:]])
 
 
 def whitened_motion(knots: Knots, strength: float, motion: Array) -> Array:
-    """The translation's process noise into each knot, or its state at a segment's first, over its sd, (K, 9) or
-    (K, 9, p) as `motion` is: linear in it."""
+    """Process noise of the translation into each knot, or the state itself at the first knot of a segment, over its sd:
+    (K, 9) or (K, 9, p) like `motion`, in which it is linear."""
     ahead, behind, first = _process(knots, strength)
     y = motion.reshape(len(motion), ORDER, -1)
     out = first @ y
@@ -254,12 +262,12 @@ def whitened_motion(knots: Knots, strength: float, motion: Array) -> Array:
 
 
 def joint_squares(knots: Knots, joints: Joints, state: Array, theta: Array, probe: Probe) -> Array:
-    """(2, 3): for attitude jumps and for the translation, the whitened squares s, how many of them are free e = tr M,
-    and tr M² for M = I − (what the unknowns absorb). ½(s − e) and ½ tr M² are score and information of the logarithm
-    of the group's variance.
+    """(2, 3): for attitude jumps and for the translation, the sum s of the whitened squares, its expectation e = tr M,
+    and tr M², for M = I − (the projection on what the unknowns can explain). ½(s − e) and ½ tr M² are score and
+    information of the logarithm of the group's variance.
 
-    `state` (K, s, c) and `theta` (p, c) are the responses to the right-hand sides: those to the groups' own probes z
-    give e = zᵀMz and tr M² = ‖Mz‖²."""
+    `state` (K, s, c) and `theta` (p, c) are the responses of the unknowns to the right-hand sides: those to a group's
+    probe z give e = zᵀMz and tr M² = ‖Mz‖²."""
     root = np.sqrt(knots.joined / (joints.walk * knots.interval_s))[:, None]
     by_jump, by_motion = state[..., JUMP], state[..., MOTION]
     left = probe.jump * knots.joined[:, None]
@@ -279,11 +287,12 @@ def joint_squares(knots: Knots, joints: Joints, state: Array, theta: Array, prob
 
 @dataclass(frozen=True)
 class Probe:
-    """Fixed random signs, one for each residual: pushed through the fit they measure how much of each group of
-    residuals the unknowns absorb (Monte-Carlo variance components: García-Cortés et al. 1992, Kusche 2003).
+    """Fixed random signs, one for each residual: passed through the fit they measure how many degrees of freedom of
+    each group of residuals the unknowns absorb (Monte-Carlo variance components: García-Cortés et al. 1992, Kusche
+    2003).
 
-    `bridge` is what gyroscope noise of unit density about each body axis makes of the attitude at every row, tied to
-    nothing at the knots on either side."""
+    `bridge` is the attitude error that gyroscope noise of unit density about each body axis leaves at every row, zero
+    at the knots on either side (a Brownian bridge)."""
 
     sensors: Array  # (n, rows)
     jump: Array  # (K−1, 3)
@@ -298,7 +307,7 @@ class Probe:
         k = len(knots.index)
         shapes = ((len(at), rows), (k - 1, 3), (k - 1, ORDER, 3), (k, ORDER, 3), (len(t), 3))
         sensors, jump, motion, start, noise = (rng.integers(0, 2, shape) * 2.0 - 1.0 for shape in shapes)
-        steps = 0.5 * (noise[1:] + noise[:-1]) * np.sqrt(np.diff(t))[:, None]  # trapezoidal, as it is integrated
+        steps = 0.5 * (noise[1:] + noise[:-1]) * np.sqrt(np.diff(t))[:, None]  # trapezoidal, like the attitude
         walked = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
         knot, share = knots.of_sample[at], knots.share[at, None]
         after = np.minimum(knot + 1, k - 1)

@@ -1,4 +1,4 @@
-"""Standard deviations one can fly on: the joint covariance with coloured residuals, and what would make it smaller."""
+"""Covariance of the joint estimate from coloured residuals, and advice which motion would make it smaller."""
 
 from __future__ import annotations
 
@@ -11,6 +11,13 @@ from fieldcal.estimation.joint.problem import Model, State
 from fieldcal.estimation.statistics import coloured_information, variance_by_blocks
 from fieldcal.geometry.rotation import Array
 
+ADVICE_RELATIVE_SD = 0.01  # of a scale; a smaller one needs no advice
+TURNS = ("roll", "pitch", "yaw")
+STEEP_FIELD_RAD = np.pi / 4
+# Turns that change the component of gravity, or of a steep field, along each body axis; and of a level field.
+TURNS_FOR_STEEP_VECTOR = (("pitch",), ("roll",), ("roll", "pitch"))
+TURNS_FOR_LEVEL_VECTOR = (("yaw",), ("yaw",), ("roll", "pitch"))
+
 
 def covariance(
     model: Model,
@@ -22,13 +29,13 @@ def covariance(
     process: tuple[Array, Array],
     others: tuple[Array, Array] | None = None,
 ) -> Array:
-    """Covariance (p, p) of θ: the inverse information, enlarged where the residuals say that it is too small.
+    """Covariance (p, p) of θ: the inverse information, enlarged where the residuals show that it is too small.
 
-    Noise correlated within an interval is in the whitening already. What is correlated over longer times (a field that
-    varies from place to place, a temperature) is judged from means by interval: M = ΣΣ S̄ᵀ𝓡S̄ instead of ΣS̄ᵀS̄ for each
-    sensor row, S̄ the sensitivity with the knots eliminated. And what is not the noise that the model thinks (strong for
-    some seconds and weak for others, a translation that swings at one frequency) from the scores S̄ᵀr of blocks of
-    time, all residuals together (`variance_by_blocks`). No standard deviation is ever made smaller by either.
+    Correlation of the noise within an interval is in the whitening already. Correlation over longer times (a field that
+    varies from place to place, a temperature) is measured on means by interval: M = ΣΣ S̄ᵀ𝓡S̄ instead of ΣS̄ᵀS̄ for
+    each residual of the rows, S̄ the sensitivity with the knots eliminated. Noise unlike the model's (strong for some
+    seconds and weak for others, a translation that swings at one frequency) is measured by the scores S̄ᵀr of blocks of
+    time, all residuals together (`variance_by_blocks`). Neither ever makes a standard deviation smaller.
 
     Parameters
     ----------
@@ -39,14 +46,14 @@ def covariance(
     information : (p, p) array
         Of θ, knots eliminated.
     whitening : (m, r) array
-        Weights over low-frequency variance.
+        Robust weights over the density of the noise at low frequency.
     jumps : (K−1, 3), (K−1,) arrays
-        Of the attitude at the joints and 1/their sd: coloured where the gyroscope's bias drifts.
+        Attitude jumps at the joints, and 1/their sd: coloured where the gyroscope's bias drifts.
     process : (K, c, p), (K, c) arrays
-        Whitened sensitivities, knots eliminated, and residuals of the translation's process. They are not judged for
-        colour: what is left of them after the fit has it by the fit alone.
+        Whitened sensitivities, knots eliminated, and residuals of the translation's process. Their colour is not used:
+        the fit alone colours them.
     others : (K, c, p), (K, c) arrays, optional
-        The same of what else was measured at the knots.
+        The same of other measurements at the knots (VPS poses).
     """
     inverse = inverse_information(information)
     k, r, p = len(response), whitening.shape[1], len(information)
@@ -54,19 +61,21 @@ def covariance(
     residual[:-1, r:], count[:-1, r:] = jumps[0] * jumps[1][:, None], 1.0
     sensitivity[:-1, r:] = np.diff(response[:, :3], axis=0)
     score = np.zeros((k, p))
-    for ties, rows, ends in chunks:
-        at = model.at[rows.own]
+    for knot_span, rows, ends in chunks:
+        at = model.at[rows.span]
         knot, share = model.knots.of_sample[at], model.knots.share[at, None, None]
         after = np.minimum(knot + 1, k - 1)
         between = (1.0 - share) * response[knot][:, SENSED] + share * response[after][:, SENSED]
-        root = np.sqrt(whitening[rows.own])
-        own = (rows.by_parameter - rows.by_knot @ between) * root[..., None]
-        sensitivity[ties, :r] = sums_by_interval(model, own.reshape(len(at), -1), rows.own, ties).reshape(-1, r, p)
-        sensitivity[ties, r:] += ends
+        root = np.sqrt(whitening[rows.span])
+        seen = (rows.by_parameter - rows.by_knot @ between) * root[..., None]
+        sensitivity[knot_span, :r] = sums_by_interval(model, seen.reshape(len(at), -1), rows.span, knot_span).reshape(
+            -1, r, p
+        )
+        sensitivity[knot_span, r:] += ends
         left = rows.residual * root
-        residual[ties, :r] = sums_by_interval(model, left, rows.own, ties)
-        score[ties] += sums_by_interval(model, np.einsum("mrp,mr->mp", own, left), rows.own, ties)
-        count[ties, :r] = sums_by_interval(model, (root > 0).astype(float), rows.own, ties)
+        residual[knot_span, :r] = sums_by_interval(model, left, rows.span, knot_span)
+        score[knot_span] += sums_by_interval(model, np.einsum("mrp,mr->mp", seen, left), rows.span, knot_span)
+        count[knot_span, :r] = sums_by_interval(model, (root > 0).astype(float), rows.span, knot_span)
     sensitivity[:-1, r:] *= jumps[1][:, None, None]
     for seen, left in ((sensitivity[:, r:], residual[:, r:]), process, *([] if others is None else [others])):
         score += np.einsum("kcp,kc->kp", seen, left)
@@ -96,26 +105,18 @@ def inverse_information(information: Array) -> Array:
     return np.asarray(np.linalg.pinv(information * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale))
 
 
-WEAK_RELATIVE_SD = 0.01
-TURNS = ("roll", "pitch", "yaw")
-STEEP_RAD = np.pi / 4
-# Turns that swing gravity, or a steep field, along each body axis; and a level field.
-SWINGS = (("pitch",), ("roll",), ("roll", "pitch"))
-LEVEL_SWINGS = (("yaw",), ("yaw",), ("roll", "pitch"))
-
-
 def advice(model: Model, state: State, layout: Mapping[str, slice], covariance: Array, axes: Array) -> str:
-    """Which scales are weak and which motion would help, in a sentence or two; empty where all are within 1 %.
+    """Which scales are uncertain and which motion would help, in a sentence or two; empty where all are within 1 %.
 
-    A gyroscope's axis is seen when the vehicle turns about it; a vector triad's when the sensed vector swings along it.
-    `axes` (3, 3) turns sensor axes into nose, starboard, underside."""
+    A gyroscope's scale is observable when the vehicle turns about its axis; a vector triad's when the component of the
+    sensed vector along it changes. `axes` (3, 3) turns sensor axes into nose, starboard, underside."""
     weak = []
-    for name, own in layout.items():
+    for name, columns in layout.items():
         if name not in model.triads:
             continue
-        variance = np.diagonal(covariance)[own.start : own.start + 3]
+        variance = np.diagonal(covariance)[columns.start : columns.start + 3]
         relative = np.sqrt(variance) / np.abs(state.values[name][:3])
-        weak += [(float(sd), name, i) for i, sd in enumerate(relative) if sd > WEAK_RELATIVE_SD]
+        weak += [(float(sd), name, i) for i, sd in enumerate(relative) if sd > ADVICE_RELATIVE_SD]
     if not weak:
         return ""
     (sd, name, axis), *others = sorted(weak, reverse=True)
@@ -123,10 +124,10 @@ def advice(model: Model, state: State, layout: Mapping[str, slice], covariance: 
     if name == "gyroscope":
         turns: tuple[str, ...] = (TURNS[body],)
     else:
-        level = name == "magnetometer" and abs(float(state.values["dip"][0])) < STEEP_RAD
-        turns = (LEVEL_SWINGS if level else SWINGS)[body]
-    told = f"The {name}'s {'xyz'[axis]} scale is the weakest (sd {100 * sd:.1f} %): add 60° of {' and of '.join(turns)}"
-    told += " either way, several times."
+        level = name == "magnetometer" and abs(float(state.values["dip"][0])) < STEEP_FIELD_RAD
+        turns = (TURNS_FOR_LEVEL_VECTOR if level else TURNS_FOR_STEEP_VECTOR)[body]
+    text = f"The {name}'s {'xyz'[axis]} scale is the weakest (sd {100 * sd:.1f} %): add 60° of {' and of '.join(turns)}"
+    text += " either way, several times."
     if others:
-        told += " Above 1 % too: " + ", ".join(f"{n} {'xyz'[i]} {100 * v:.1f} %" for v, n, i in others) + "."
-    return told
+        text += " Above 1 % too: " + ", ".join(f"{n} {'xyz'[i]} {100 * v:.1f} %" for v, n, i in others) + "."
+    return text

@@ -1,10 +1,10 @@
 """All three triads, attitude, dip and lever arm at once: the joint maximum-likelihood estimator (method `joint`).
 
 "The method is serial in nature, so good estimates must be determined at each step or the error will compound." Here
-nothing is handed on: the gyroscope is integrated between knots (`chain_solver`), every magnetometer and accelerometer
-reading is predicted in its sensor's own logged units (`measurement_model`), and Gauss–Newton moves everything together.
-Noise levels (each sensor axis, gyroscope walk, strength of the translation) are estimated beside it as variance
-components, so nothing has to be tuned.
+no estimate is passed on: the gyroscope is integrated between knots (`chain_solver`), every magnetometer and
+accelerometer reading is predicted in its sensor's logged units (`measurement_model`), and Gauss–Newton estimates all
+unknowns together. Noise levels (each sensor axis, the attitude's random walk by gyroscope noise, strength of the
+translation) are estimated at the same time as variance components, so nothing has to be tuned.
 """
 
 from __future__ import annotations
@@ -49,30 +49,32 @@ from fieldcal.estimation.joint.variance_components import (
     Levels,
     first_levels,
     gyro_walk,
+    largest_level_change,
     passing_fields,
     renewed_levels,
     robust_weight,
-    unsettled_by,
 )
 from fieldcal.estimation.statistics import white_noise_sigma
 from fieldcal.geometry.rotation import Array
 
-LARGEST_TURN_RAD, LARGEST_RELATIVE = 0.5, 0.3
-BURST_ROUNDS = 3  # how often the fit looks for passing fields in what it left of the magnetometer
+# Largest step of an attitude and of a scale: a longer one is shortened as a whole.
+LARGEST_STEP_RAD, LARGEST_STEP_RELATIVE = 0.5, 0.3
+BURST_ROUNDS = 3  # of searching the magnetometer's residuals for passing fields and fitting again without them
 MAX_ITERATIONS = 50
-# A step that takes back more than this part of the one before is taken to this part only: the slope lacks that of the
-# gradient's corrections, so that steps may be too long.
-TOO_FAR = 0.5
-ASTRAY = 20  # iterations after which a fit that has not settled starts anew from the constants reached
-# Settled: every step below this part of what one could claim as standard deviation, every noise level below it too.
-SETTLED = 0.1
-ROUNDING = 1e-8  # of centred parameters, which are of order one: nothing left to gain
-STILL = 0.4  # part of an axis' readings, rms, that sample-to-sample noise is where nothing else can be told of it
-# Wald test of the lever arm, χ²₃: passed by chance once in a thousand.
-LEVER_ARM_GATE = 16.3
-# What is believed before the first reading: relative sd of scales, and of biases in units of the sensed range.
+# A step that reverses more than this share of the one before is shortened to this share: the normal equations lack the
+# derivative of the gradient's corrections, so that steps may be too long.
+LARGEST_REVERSED_STEP_SHARE = 0.5
+RESTART_AFTER_ITERATIONS = 20  # a fit that has not converged by then starts anew from the constants it has reached
+# Converged: every step below this share of the parameter's sd (inverse information), every relative change of a noise
+# level below it too.
+CONVERGED_STEP_SD = 0.1
+SMALLEST_STEP = 1e-8  # of centred parameters, which are of order one: rounding; also converged
+LARGEST_NOISE_SHARE = 0.4  # of an axis' readings, rms: with more sample-to-sample noise its scale cannot be estimated
+# Wald test of the lever arm, χ²₃: exceeded by chance once in a thousand.
+LEVER_ARM_CHI2 = 16.3
+# Weak prior: relative sd of scales, and sd of biases in units of the sensed range.
 PRIOR_RELATIVE_SD = 0.5
-VAGUE = 1.0  # rad of dip, m of lever arm
+OTHER_PRIOR_SD = 1.0  # of all other parameters, each in its unit: rad of dip, m of lever arm, s of delay …
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,8 @@ class JointFit:
 
     `covariance` (p, p) of θ, coloured-residual form; `information` (p, p) with the knots eliminated; `weight` (m, r)
     robust weights; `iterations` of all rounds; `bias_walk` of the gyroscope's bias, rad/s/√s, whose spread over the
-    record is in its covariance; `lever_arm_test` the Wald statistic (χ²₃) of a free lever arm, None where it was not
-    tried."""
+    record is part of its covariance; `lever_arm_test` the Wald statistic (χ²₃) of a free lever arm, None where it was
+    not estimated."""
 
     model: Model
     state: State
@@ -99,20 +101,20 @@ class JointFit:
 
     def constants(self, name: str) -> tuple[Array, Array, Array]:
         """(λ (3,), b (3,), covariance (6, 6)) of a triad without cross-axis terms, logged units."""
-        triad, own = self.model.triads[name], self.layout[name]
+        triad, columns = self.model.triads[name], self.layout[name]
         transform = triad.to_logged()
-        return *triad.logged(self.state.values[name]), transform @ self.covariance[own, own] @ transform.T
+        return *triad.logged(self.state.values[name]), transform @ self.covariance[columns, columns] @ transform.T
 
     def full_constants(self, name: str) -> tuple[Array, Array, Array]:
         """(Λ (3, 3), b (3,), covariance (12, 12) of Λ by rows and b) of a triad with cross-axis terms, logged units."""
-        triad, own, scaled = self.model.triads[name], self.layout[name], self.state.values[name]
+        triad, columns, scaled = self.model.triads[name], self.layout[name], self.state.values[name]
         cross = f"{name}_cross"
         e = off_diagonal(name, self.state.values[cross]) if cross in self.layout else np.zeros((3, 3))
         matrix = scaled[:3, None] * (np.eye(3) + e) / triad.spread
         jacobian = np.zeros((12, len(self.covariance)))
         for i in range(3):
-            jacobian[3 * i : 3 * i + 3, own.start + i] = matrix[i] / scaled[i]
-            jacobian[9 + i, own.start + 3 + i] = 1.0
+            jacobian[3 * i : 3 * i + 3, columns.start + i] = matrix[i] / scaled[i]
+            jacobian[9 + i, columns.start + 3 + i] = 1.0
         if cross in self.layout:
             for k, (i, j) in enumerate(CROSS[name]):
                 jacobian[3 * i + j, self.layout[cross].start + k] = scaled[i] / triad.spread[j]
@@ -129,7 +131,7 @@ def fit_joint(
     vps: VpsRecord | None = None,
     levels: Levels | None = None,
 ) -> JointFit:
-    """Estimate everything from a start within some tens of per cent.
+    """Estimate all constants, attitudes and noise levels from a start within some tens of per cent.
 
     Parameters
     ----------
@@ -137,16 +139,16 @@ def fit_joint(
         The record, knots placed.
     start : State
         Attitudes of the knots within about 30°, constants with the right polarity. Its lever arm is kept unless
-        `try_lever_arm`. Optional terms (`joint.measurement_model.OPTIONAL`) that it has a value for are estimated too.
+        `try_lever_arm`. Optional terms (`joint.problem.OPTIONAL`) that it has a value for are estimated too.
     free_dip : bool
         Estimate the dip angle; otherwise that of the configured field holds.
     try_lever_arm : bool
-        Estimate the lever arm, and keep it only where it differs from none (Wald test): estimating it on data that do
-        not show it costs accuracy.
+        Estimate the lever arm, and keep it only where it differs from zero (Wald test): estimating it on data that do
+        not determine it costs accuracy.
     vps : VpsRecord, optional
         Reference attitudes; `start` then holds `VpsRecord.start()` too.
     levels : Levels, optional
-        Noise to start from, that of a fit nearby.
+        Noise to start from, that of a similar fit.
 
     Raises
     ------
@@ -156,13 +158,14 @@ def fit_joint(
     Notes
     -----
     The likelihood is maximised over the attitudes, with every residual in logged units: that is consistent (a rate or
-    a length in SI units would shrink with its scale). Translation is noise to the accelerometer's scale, which is found
-    from gravity and lever arm alone: then no spectrum or direction of translation draws it off, whatever its prior.
+    a length in SI units would shrink with its scale). Translation is noise to the accelerometer's scale, which is
+    estimated from gravity and lever arm alone: then no spectrum or direction of translation biases it, whatever its
+    prior.
 
-    It cannot see what moves all triads together with the body: a common rotation of the axes, or a field that turns
-    with the vehicle other than hard iron.
+    It cannot see what turns with the body and all triads: a common rotation of the axes, or a field that turns with the
+    vehicle other than hard iron.
     """
-    free = try_lever_arm and "accelerometer" in model.rows
+    free = try_lever_arm and "accelerometer" in model.vectors
     fit, response = _iterate(model, start, levels, 0, dip=free_dip, lever_arm=free, vps=vps)
     for _ in range(BURST_ROUNDS):
         passing = passing_fields(fit.model, fit.weight)
@@ -173,13 +176,15 @@ def fit_joint(
     if not free:
         return _enlarged(fit, response)
     test = _lever_arm_test(fit)
-    if test >= LEVER_ARM_GATE:  # colour makes it smaller at most
+    if test >= LEVER_ARM_CHI2:  # the coloured covariance can only make it smaller
         fit = _enlarged(fit, response)
         test = _lever_arm_test(fit)
-    if test < LEVER_ARM_GATE:
-        own = fit.layout["lever_arm"]
-        none = fit.covariance[:, own] @ np.linalg.solve(fit.covariance[own, own], fit.state.values["lever_arm"])
-        without = fit.state.moved(response @ none, -none, fit.layout)
+    if test < LEVER_ARM_CHI2:
+        columns = fit.layout["lever_arm"]
+        # The state given a lever arm of zero: every other parameter follows by its covariance with the lever arm.
+        to_zero = np.linalg.solve(fit.covariance[columns, columns], fit.state.values["lever_arm"])
+        change = fit.covariance[:, columns] @ to_zero
+        without = fit.state.moved(response @ change, -change, fit.layout)
         without = replace(without, values={**without.values, "lever_arm": np.zeros(3)})
         fit, response = _iterate(fit.model, without, fit.levels, fit.iterations, dip=free_dip, lever_arm=False, vps=vps)
         fit = _enlarged(fit, response)
@@ -187,12 +192,12 @@ def fit_joint(
 
 
 def _lever_arm_test(fit: JointFit) -> float:
-    own, arm = fit.layout["lever_arm"], fit.state.values["lever_arm"]
-    return float(arm @ np.linalg.solve(fit.covariance[own, own], arm))
+    columns, arm = fit.layout["lever_arm"], fit.state.values["lever_arm"]
+    return float(arm @ np.linalg.solve(fit.covariance[columns, columns], arm))
 
 
 def _enlarged(fit: JointFit, response: Array) -> JointFit:
-    """With the covariance that coloured residuals leave; `response` (K, s, p) of the knots to the parameters."""
+    """The fit with its covariance from coloured residuals; `response` (K, s, p) of the knots to the parameters."""
     chunks = sensitivities(fit.model, fit.state, fit.path, fit.layout, len(fit.information))
     whitening = _whitening(fit.weight, fit.levels)
     poses = None if fit.vps is None else fit.vps.whitened(fit.model, fit.state, fit.path, fit.layout, response)
@@ -200,62 +205,64 @@ def _enlarged(fit: JointFit, response: Array) -> JointFit:
     jumps = fit.path.jump, np.sqrt(knots.joined / (fit.levels.walk * knots.interval_s))
     strength = fit.levels.strength
     process = whitened_motion(knots, strength, response[:, 3:]), whitened_motion(knots, strength, fit.state.motion)
-    own = covariance(fit.model, chunks, response, fit.information, whitening, jumps, process, poses)
-    # The bias is the record's mean; its own walk takes it away from that to either end.
+    enlarged = covariance(fit.model, chunks, response, fit.information, whitening, jumps, process, poses)
+    # The bias is the mean over the record, from which its random walk takes it away towards either end.
     rate = body_jumps(fit.state, fit.path) / knots.interval_s[:, None]
     walk = bias_walk(rate, knots.interval_s, knots.joined)
     bias = np.arange(3, 6) + fit.layout["gyroscope"].start
-    own[bias, bias] += walk**2 * (fit.model.readings.t[-1] - fit.model.readings.t[0]) / 3.0
-    return replace(fit, covariance=own, bias_walk=walk)
+    enlarged[bias, bias] += walk**2 * (fit.model.readings.t[-1] - fit.model.readings.t[0]) / 3.0
+    return replace(fit, covariance=enlarged, bias_walk=walk)
 
 
 def _iterate(
     model: Model, state: State, levels: Levels | None, spent: int, *, dip: bool, lever_arm: bool, vps: VpsRecord | None
 ) -> tuple[JointFit, Array]:
-    """Gauss–Newton with noise levels renewed at every step: the fit with the inverse information as covariance, and the
-    knots' response N_xx⁻¹N_xθ. `spent` iterations came before."""
+    """Gauss–Newton with noise levels estimated anew at every step: the fit with the inverse information as covariance,
+    and the knots' response N_xx⁻¹N_xθ. `spent` iterations are counted on top."""
     layout, p = layout_of(model, state.values, dip=dip, lever_arm=lever_arm)
     knots, prior = model.knots, _Prior.at(model, state, layout, p)
-    probe = Probe.draw(knots, model.readings.t, model.at, 3 * len(model.rows))
+    probe = Probe.draw(knots, model.readings.t, model.at, 3 * len(model.vectors))
     path = trajectory(model, state)
     residual = residuals(model, state, path)
     levels = levels or first_levels(model, state, path, residual)
-    before: Array = np.zeros(p)
+    previous: Array = np.zeros(p)
     for iteration in range(1, MAX_ITERATIONS + 1):
-        if iteration == ASTRAY:
+        if iteration == RESTART_AFTER_ITERATIONS:
             state = initialise.anew(model, state)
             path = trajectory(model, state)
             residual = residuals(model, state, path)
-            levels, before = first_levels(model, state, path, residual), np.zeros(p)
+            levels, previous = first_levels(model, state, path, residual), np.zeros(p)
         weight = robust_weight(model, residual, levels)
         normal, joints, reaction = linearised(model, state, path, layout, p, weight, levels, probe, vps)
         prior.add(normal, state, layout)
         eliminated, information, gradient = normal.eliminate()
-        own = layout["gyroscope"].start + np.arange(3)
-        gradient[own, GRADIENT] += logged_units(model, state, path, levels.walk)
+        scales = layout["gyroscope"].start + np.arange(3)
+        gradient[scales, GRADIENT] += logged_units(model, state, path, levels.walk)
         within = levels.walk * within_intervals(model, state, layout, reaction, eliminated[:, :, p + BRIDGE])
         gradient[:, GRADIENT] += within
+        # The step (column GRADIENT), and the responses of all unknowns to the probes.
         theta = solve_scaled(information, gradient)
         response = eliminated[:, :, p:] - eliminated[:, :, :p] @ theta
         step, change = response[:, :, GRADIENT], theta[:, GRADIENT]
-        least = _least_part(state, step, change, layout)
-        if change @ information @ before < -TOO_FAR * (before @ information @ before):
-            least *= TOO_FAR
-        before = least * change
-        state = state.moved(least * step, least * change, layout)
+        share = _step_share(state, step, change, layout)
+        if change @ information @ previous < -LARGEST_REVERSED_STEP_SHARE * (previous @ information @ previous):
+            share *= LARGEST_REVERSED_STEP_SHARE
+        previous = share * change
+        state = state.moved(share * step, share * change, layout)
         path = trajectory(model, state)
         residual = residuals(model, state, path)
         if not np.isfinite(residual).all():
             break
-        own_knots, own_theta = (x[..., : residual.shape[1]] for x in (reaction[0], reaction[1][:p]))
-        absorbed = np.einsum("kcr,kc->r", own_knots, response[:, SENSED, SENSORS]) + own_theta.T @ theta[:, SENSORS]
+        # Noise levels, by how many degrees of freedom the unknowns absorb of each group of residuals.
+        at_knots, at_parameters = (x[..., : residual.shape[1]] for x in (reaction[0], reaction[1][:p]))
+        absorbed = np.einsum("kcr,kc->r", at_knots, response[:, SENSED, SENSORS]) + at_parameters.T @ theta[:, SENSORS]
         joints = replace(joints, jump=path.jump, motion=state.motion)
         squares = joint_squares(knots, joints, response, theta, probe)
         renewed = renewed_levels(model, residual, levels, absorbed, squares, gyro_walk(model, state))
-        unsettled, levels = unsettled_by(levels, renewed, squares), renewed
-        claimed = 1.0 / np.sqrt(np.diagonal(information))
-        settled = max(unsettled, float(np.max(np.abs(change) / claimed))) < SETTLED
-        if settled or float(np.max(np.abs(change))) < ROUNDING:
+        level_change, levels = largest_level_change(levels, renewed, squares), renewed
+        sd = 1.0 / np.sqrt(np.diagonal(information))
+        converged = max(level_change, float(np.max(np.abs(change) / sd))) < CONVERGED_STEP_SD
+        if converged or float(np.max(np.abs(change))) < SMALLEST_STEP:
             plain = inverse_information(information)
             fit = JointFit(model, state, path, levels, weight, layout, plain, information, spent + iteration, vps=vps)
             return fit, eliminated[:, :, :p]
@@ -263,11 +270,11 @@ def _iterate(
 
 
 def _no_minimum(model: Model, iterations: int) -> EstimationError:
-    """Why there is none: axes that show hardly anything but noise, if there are such, or else the readings."""
+    """Why no minimum was found: axes that read little but noise, if there are any, or else contradictory readings."""
     still = [
         f"{name} {'xyz'[axis]}"
         for name, triad in model.triads.items()
-        for axis in np.flatnonzero(white_noise_sigma(triad.x[triad.known]) > STILL)
+        for axis in np.flatnonzero(white_noise_sigma(triad.x[triad.valid]) > LARGEST_NOISE_SHARE)
     ]
     if still:
         return EstimationError(
@@ -294,16 +301,17 @@ def linearised(
     probe: Probe,
     vps: VpsRecord | None,
 ) -> tuple[Normal, Joints, tuple[Array, Array]]:
-    """Normal equations of everything but the prior, the joints in them, and every row's own reaction to the probe."""
-    knots, rows = len(model.knots.index), 3 * len(model.rows)
+    """Normal equations without the prior, the joints that they contain, and what reacts to each row's probe
+    (`accumulate`)."""
+    knots, rows = len(model.knots.index), 3 * len(model.vectors)
     normal = Normal.empty(knots, p, len(RIGHTS))
     reaction = np.zeros((knots, len(SENSED), 2 * rows + 3)), np.zeros((p + 1, 2 * rows + 3))
     moved = np.zeros((knots, 3, p))  # ∂(integrated attitude)/∂θ
     whitening = _whitening(weight, levels)
     chunk: Rows
-    for ties, chunk, ends in sensitivities(model, state, path, layout, p):
-        accumulate(normal, model, chunk, ties, whitening[chunk.own], probe, reaction)
-        moved[ties] = ends
+    for knot_span, chunk, ends in sensitivities(model, state, path, layout, p):
+        accumulate(normal, model, chunk, knot_span, whitening[chunk.span], probe, reaction)
+        moved[knot_span] = ends
     joints = Joints(path.jump, moved[:-1], levels.walk, state.motion, levels.strength)
     add_joints(normal, model.knots, joints, probe)
     if vps is not None:
@@ -312,24 +320,24 @@ def linearised(
 
 
 def _whitening(weight: Array, levels: Levels) -> Array:
-    """Robust weights over what low-frequency noise the rows carry, (m, r), 1/x²."""
+    """Robust weights over the density of the rows' noise at low frequency, (m, r), 1/x²."""
     return np.asarray(weight / (levels.variance * levels.colour))
 
 
 @dataclass(frozen=True)
 class _Prior:
-    """Vague belief about constants, so that directions that the record does not show stay where they started."""
+    """Weak prior on the constants, which keeps directions that the record does not determine at their start."""
 
     mean: Array
     information: Array
 
     @classmethod
     def at(cls, model: Model, state: State, layout: Mapping[str, slice], p: int) -> _Prior:
-        mean, sd = np.zeros(p), np.full(p, VAGUE)
-        for name, own in layout.items():
-            mean[own] = state.values[name]
+        mean, sd = np.zeros(p), np.full(p, OTHER_PRIOR_SD)
+        for name, columns in layout.items():
+            mean[columns] = state.values[name]
             if name in model.triads:
-                sd[own] = PRIOR_RELATIVE_SD * np.tile(np.abs(state.values[name][:3]), 2)
+                sd[columns] = PRIOR_RELATIVE_SD * np.tile(np.abs(state.values[name][:3]), 2)
         if "lever_arm" in layout:
             mean[layout["lever_arm"]] = 0.0
         return cls(mean, 1.0 / sd**2)
@@ -340,11 +348,11 @@ class _Prior:
         normal.parameters_right[:, 0] += self.information * (self.mean - now)
 
 
-def _least_part(state: State, step: Array, theta: Array, layout: Mapping[str, slice]) -> float:
-    """Part of a step that may be taken: no attitude by more than LARGEST_TURN_RAD, no scale by LARGEST_RELATIVE."""
-    longest = [float(np.max(np.abs(step[:, :3]))) / LARGEST_TURN_RAD]
-    for name, own in layout.items():
+def _step_share(state: State, step: Array, theta: Array, layout: Mapping[str, slice]) -> float:
+    """Share of a step to take: no attitude by more than LARGEST_STEP_RAD, no scale by LARGEST_STEP_RELATIVE."""
+    longest = [float(np.max(np.abs(step[:, :3]))) / LARGEST_STEP_RAD]
+    for name, columns in layout.items():
         if name in TRIADS:
             scale = np.abs(state.values[name][:3])
-            longest.append(float(np.max(np.abs(theta[own][:3]) / scale)) / LARGEST_RELATIVE)
+            longest.append(float(np.max(np.abs(theta[columns][:3]) / scale)) / LARGEST_STEP_RELATIVE)
     return 1.0 / max(1.0, *longest)

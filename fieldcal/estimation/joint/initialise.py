@@ -1,4 +1,5 @@
-"""Where the joint estimator starts: constants from whatever is known, attitudes from the vectors they give."""
+"""Start of the joint estimator: constants from the serial chain or from ellipsoids, attitudes from calibrated
+vectors."""
 
 from __future__ import annotations
 
@@ -25,15 +26,16 @@ from fieldcal.geometry.rotation import (
     multiply,
 )
 
-SPACING_S = 0.08
+KNOT_SPACING_S = 0.08
 START_CUTOFF_HZ = 4.0
-# Low-passes (cut-off, Hz; reach on either side, s) of the vectors that the gyroscope carries: the longer, the less of
-# translation and passing magnets is left, and the more of what the gyroscope drifts.
+# Low-passes (cut-off, Hz; length on either side, s) of the vectors in the axes of the integrated gyroscope: the longer,
+# the less translation and passing magnets disturb them, and the more the gyroscope's drift does.
 WINDOWS = ((0.2, 1.5), (0.07, 4.5), (0.02, 15.0))
-TRUST = 0.1  # relative; a field that far off its own mean has half the weight
-# Rates for the lever arm: their derivative's noise would shrink it (a regressor), so they end, within 0.8 Hz
-# (π/TURNING_SIDE_S), where turning no longer has OVER_NOISE times the density of noise, which is that of NOISE_HZ.
-OVER_NOISE, TURNING_SIDE_S, SPECTRUM_S = 10.0, 4.0, 8.0
+HALF_WEIGHT_EXCESS = 0.1  # relative; a field that far off its mean has half the weight
+# Cut-off of the rates for the lever arm: noise of their derivative, a regressor, would shrink it. So they are cut off,
+# to within 0.8 Hz (π/TURNING_SIDE_S), where the density of the turning falls below LEAST_DENSITY_OVER_NOISE times that
+# of the noise, which is measured in the band NOISE_HZ.
+LEAST_DENSITY_OVER_NOISE, TURNING_SIDE_S, SPECTRUM_S = 10.0, 4.0, 8.0
 NOISE_HZ, TURNING_HZ = (5.0, 20.0), (0.5, 5.0)
 
 Constants = tuple[Array, Array]
@@ -57,8 +59,8 @@ def turning(t: Array, segment: np.ndarray, gyroscope: Array) -> Array:
 
 
 def _fastest_turning_hz(t: Array, segment: np.ndarray, gyroscope: Array) -> float:
-    """Up to which frequency the longest stretch's spectrum stands out of the gyroscope's noise, axes taken together."""
-    a, b = max(run_bounds(segment), key=lambda own: own[1] - own[0])
+    """Frequency up to which the longest segment's spectrum, mean of the axes, is above the gyroscope's noise."""
+    a, b = max(run_bounds(segment), key=lambda bounds: bounds[1] - bounds[0])
     index, interval_s = lattice(t[a:b])
     x = fill(index, gyroscope[a:b])
     frequency, density = welch(x, 1.0 / interval_s, nperseg=min(len(x), round(SPECTRUM_S / interval_s)), axis=0)
@@ -66,16 +68,16 @@ def _fastest_turning_hz(t: Array, segment: np.ndarray, gyroscope: Array) -> floa
     noise = np.median(density[(frequency >= from_hz) & (frequency <= max(NOISE_HZ[1], from_hz))], axis=0)
     over = np.mean(density / np.maximum(noise, 1e-300), axis=1)
     strongest = int(np.argmax(over * (frequency <= TURNING_HZ[1])))
-    lost = strongest + np.flatnonzero(over[strongest:] < OVER_NOISE)
+    lost = strongest + np.flatnonzero(over[strongest:] < LEAST_DENSITY_OVER_NOISE)
     return float(np.clip(frequency[max(lost[0] - 1, 0)] if len(lost) else np.inf, *TURNING_HZ))
 
 
 def start_of_triad(logged: Array, magnitude: float, polarity: Array) -> Constants | None:
-    """Ellipsoid constants good enough to start from: the refined fit, else an algebraic one."""
-    known = logged[np.isfinite(logged).all(axis=1)]
+    """Ellipsoid constants to start from: the refined fit, else an algebraic one; None where no fit succeeds."""
+    valid = logged[np.isfinite(logged).all(axis=1)]
     for method in ("robust", "li", "two_step", "tls"):
         try:
-            fit = fit_ellipsoid(known, magnitude, method=method, polarity=polarity)
+            fit = fit_ellipsoid(valid, magnitude, method=method, polarity=polarity)
         except (UnusableFlight, EstimationError, ValueError):
             continue
         return fit.scale_diagonal, fit.bias
@@ -85,16 +87,16 @@ def start_of_triad(logged: Array, magnitude: float, polarity: Array) -> Constant
 def prepare(
     readings: Readings, constants: Mapping[str, Constants | None], *, lever_arm: Array | None = None
 ) -> tuple[Model, State]:
-    """Model and start of a record.
+    """Model of a record and the state to start from.
 
     Parameters
     ----------
     readings : Readings
     constants : sensor → (λ (3,), b (3,)) or None
-        Starts in logged units, sensor axes, polarity right. A vector triad without one is left out; the gyroscope's is
-        estimated from attitudes where both vectors have one.
+        Start in logged units, sensor axes, polarity right. A vector triad without one is left out; the gyroscope's is
+        estimated from attitudes where both vector triads have one.
     lever_arm : (3,) array, optional
-        Known, m, sensor axes.
+        As measured on the vehicle, m, sensor axes; 0 without.
 
     Raises
     ------
@@ -102,21 +104,21 @@ def prepare(
         `no_start`: no vector triad has a start, or the gyroscope has none and one vector alone cannot give it.
     """
     vectors = {name: constants.get(name) for name in ("accelerometer", "magnetometer")}
-    readings = Readings(**{**vars(readings), **{name: None for name, own in vectors.items() if own is None}})
+    readings = Readings(**{**vars(readings), **{name: None for name, start in vectors.items() if start is None}})
     q, gyro = _start_attitude(readings, vectors, constants.get("gyroscope"))
-    knots = place_knots(readings.t, readings.segment, SPACING_S)
+    knots = place_knots(readings.t, readings.segment, KNOT_SPACING_S)
     rate = np.sqrt(np.mean(np.sum((gyro[0] * readings.turning[0] + gyro[1]) ** 2, axis=1)))
     model = Model.of(readings, knots, side=averaging_side(readings, 3.0 * float(rate)))
     values = {"dip": np.array([_dip(readings.field_ned)]), "lever_arm": np.zeros(3) if lever_arm is None else lever_arm}
-    for name, own in {**vectors, "gyroscope": gyro}.items():
-        if name in model.triads and own is not None:
-            values[name] = model.triads[name].scaled(*own)
+    for name, start in {**vectors, "gyroscope": gyro}.items():
+        if name in model.triads and start is not None:
+            values[name] = model.triads[name].scaled(*start)
     return model, State(q[knots.index], np.zeros((len(knots.index), STATES - 3)), values)
 
 
 def anew(model: Model, state: State) -> State:
-    """The state with attitudes from the constants that it has, as if they had been the start's, and no translation: a
-    start whose constants were far off leaves some attitudes where a passing field or translation explains them."""
+    """The state with attitudes made again from its constants, and no translation: where the constants of the start were
+    far off, some attitudes end in a minimum in which a passing field or translation explains the readings."""
     constants = {name: triad.logged(state.values[name]) for name, triad in model.triads.items()}
     vectors = {name: constants.get(name) for name in ("accelerometer", "magnetometer")}
     q, _ = _start_attitude(model.readings, vectors, constants["gyroscope"])
@@ -132,12 +134,12 @@ def _start_attitude(
 ) -> tuple[Array, Constants]:
     """Attitude of the sensor axes (n, 4) and gyroscope constants."""
     sensed = {}
-    for name, own in vectors.items():
+    for name, start in vectors.items():
         logged = r.accelerometer if name == "accelerometer" else r.magnetometer
-        if own is not None and logged is not None:
-            sensed[name] = _filled(r.t, logged) * own[0] + own[1]
+        if start is not None and logged is not None:
+            sensed[name] = _filled(r.t, logged) * start[0] + start[1]
     if len(sensed) == 2 and gyro is None:
-        both = {name: low_passed(r.t, r.segment, own, START_CUTOFF_HZ, 0.5) for name, own in sensed.items()}
+        both = {name: low_passed(r.t, r.segment, x, START_CUTOFF_HZ, 0.5) for name, x in sensed.items()}
         gyro = _gyro_from_attitude(r, continuous(_turned_to(r, both)))
     if not sensed or gyro is None:
         raise UnusableFlight(
@@ -147,19 +149,19 @@ def _start_attitude(
         )
     relative = propagate_stretches(r.t, r.gyroscope * gyro[0] + gyro[1], r.segment)
     r_nb = body_from_inertial(relative).transpose(0, 2, 1)
-    carried = {name: np.einsum("nij,nj->ni", r_nb, own) for name, own in sensed.items()}
+    carried = {name: np.einsum("nij,nj->ni", r_nb, x) for name, x in sensed.items()}
     offsets = [_turned_to(r, _means(r, carried, *window)) for window in WINDOWS]
     wander = [_wander(r.t, offset, side_s) for offset, (_, side_s) in zip(offsets, WINDOWS, strict=True)]
     return multiply(offsets[int(np.argmin(wander))], relative), gyro
 
 
 def _means(r: Readings, carried: Mapping[str, Array], cutoff_hz: float, side_s: float) -> dict[str, Array]:
-    """Vectors in the axes that the gyroscope carries, low-passed. Translation averages out; a magnet does not, so that
-    a field far off its mean counts less."""
+    """Vectors in the axes of the integrated gyroscope, low-passed. Translation averages out; a passing magnet does not,
+    so that a field far off its mean has less weight."""
     out = {name: low_passed(r.t, r.segment, x, cutoff_hz, side_s) for name, x in carried.items()}
     if "magnetometer" in carried:
         field, mean = carried["magnetometer"], out["magnetometer"]
-        limit = TRUST * np.linalg.norm(r.field_ned)
+        limit = HALF_WEIGHT_EXCESS * np.linalg.norm(r.field_ned)
         trust = 1.0 / (1.0 + np.sum(((field - mean) / limit) ** 2, axis=1, keepdims=True))
         weighted = low_passed(r.t, r.segment, np.hstack([field * trust, trust]), cutoff_hz, side_s)
         out["magnetometer"] = weighted[:, :3] / np.maximum(weighted[:, 3:], 1e-3)
@@ -167,7 +169,7 @@ def _means(r: Readings, carried: Mapping[str, Array], cutoff_hz: float, side_s: 
 
 
 def _turned_to(r: Readings, vectors: Mapping[str, Array]) -> Array:
-    """Attitudes (n, 4) of axes in which `vectors` (n, 3) are seen; with one of them the shortest turn."""
+    """Attitudes (n, 4) of the axes in which `vectors` (n, 3) are given; with one vector alone the shortest turn."""
     down = np.array([0.0, 0.0, float(np.sign(r.gravity_mps2))])
     if len(vectors) == 2:
         both = np.stack([vectors["magnetometer"], vectors["accelerometer"]], axis=1)
@@ -184,7 +186,7 @@ def _turned_to(r: Readings, vectors: Mapping[str, Array]) -> Array:
 
 
 def _wander(t: Array, offset: Array, side_s: float) -> float:
-    """Rms angle, rad, between means that share no reading: what disturbs them and what the gyroscope drifts by."""
+    """Rms angle, rad, between means that share no reading: their disturbance and the gyroscope's drift."""
     apart = int(2.0 * side_s / float(np.median(np.diff(t))))
     if apart >= len(t):
         return np.inf
@@ -192,9 +194,9 @@ def _wander(t: Array, offset: Array, side_s: float) -> float:
 
 
 def _filled(t: Array, x: Array) -> Array:
-    """Readings at every sample, linear between those there are."""
-    known = np.isfinite(x).all(axis=1)
-    return x if known.all() else np.column_stack([np.interp(t, t[known], c[known]) for c in x.T])
+    """Readings at every sample, interpolated linearly where there are none."""
+    valid = np.isfinite(x).all(axis=1)
+    return x if valid.all() else np.column_stack([np.interp(t, t[valid], c[valid]) for c in x.T])
 
 
 def _gyro_from_attitude(r: Readings, q: Array) -> Constants:

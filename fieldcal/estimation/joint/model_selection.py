@@ -1,10 +1,10 @@
-"""Optional terms of the joint estimate, each let in only where it predicts held-out segments better.
+"""Optional terms of the joint estimate, each included only where it predicts held-out data better.
 
 Cross-axis terms (a triad whose axes are not quite orthogonal or not quite the accelerometer's; soft iron), a delay of a
-vector triad behind the gyroscope, and the gyroscope's slope with temperature. On clean data each costs accuracy, so two
-gates stand before it: a score test on the whole record (cheap, no fit), and for those that pass, constants fitted on
-the first part of the record with and without the term, predicting the readings of the rest, where only attitude and
-translation are free.
+vector triad behind the gyroscope, and the gyroscope's slope with temperature. On data without the effect each costs
+accuracy, so a term must pass two tests: a score test on the whole record (cheap, no fit); then constants fitted on the
+first part of the record with and without the term predict the readings of the rest, where only attitude and translation
+are free.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from fieldcal.estimation.joint.problem import TERMS, Model, State
 from fieldcal.estimation.joint.variance_components import Levels, robust_weight
 from fieldcal.geometry.rotation import Array
 
-# Score test: χ² beyond this comes by chance once in a thousand, by degrees of freedom.
-SCORE_GATE = {1: 10.8, 3: 16.3, 6: 22.5}
-# Held-out gain over its standard deviation, from blocks of some seconds.
-GAIN_GATE, BLOCK_S, FEWEST_BLOCKS = 3.0, 2.0, 6
-FIT_SHARE = 0.6
-PREDICT_ITERATIONS, STEP_RAD = 10, 1e-6
-LEAST_WARMTH_DEGC = 1.0
+# Score test: χ² exceeded by chance once in a thousand, by degrees of freedom.
+SCORE_CHI2 = {1: 10.8, 3: 16.3, 6: 22.5}
+# Least gain of the held-out likelihood over its sd, which comes from at least so many blocks of this length.
+LEAST_GAIN_SD, BLOCK_S, FEWEST_BLOCKS = 3.0, 2.0, 6
+FIT_SHARE = 0.6  # of the record; the rest is held out
+PREDICT_ITERATIONS, PREDICT_STEP_RAD = 10, 1e-6  # most iterations, and the step at which they end
+LEAST_TEMPERATURE_RANGE_DEGC = 1.0
 LEAST_RATE_RADPS = 0.2  # rms: below it a delay does nothing
 
 
@@ -44,12 +44,12 @@ class TermTest:
 
 
 def add_terms(fit: JointFit) -> tuple[JointFit, list[TermTest]]:
-    """The fit with those optional terms that it needs, and how each was judged."""
+    """The fit with the optional terms that pass both tests, and the result of the tests."""
     scores = _scores(fit)
-    over = {name: score / SCORE_GATE[TERMS[name]] for name, score in scores.items()}
+    over = {name: score / SCORE_CHI2[TERMS[name]] for name, score in scores.items()}
     tried = sorted((name for name in over if over[name] > 1.0), key=lambda name: -over[name])
     gains = _gains(fit, tried) if tried else {}
-    kept = [name for name in tried if gains.get(name, -np.inf) > GAIN_GATE]
+    kept = [name for name in tried if gains.get(name, -np.inf) > LEAST_GAIN_SD]
     if kept:
         try:
             fit = with_terms(fit, kept)
@@ -60,23 +60,23 @@ def add_terms(fit: JointFit) -> tuple[JointFit, list[TermTest]]:
 
 def with_terms(fit: JointFit, names: list[str]) -> JointFit:
     """The same record with these terms free. Raises EstimationError."""
-    own = _refitted(fit.model, fit.state, fit.levels, fit, names, fit.vps)
-    return replace(own, iterations=fit.iterations + own.iterations)
+    refitted = _refitted(fit.model, fit.state, fit.levels, fit, names, fit.vps)
+    return replace(refitted, iterations=fit.iterations + refitted.iterations)
 
 
 def candidates(fit: JointFit) -> list[str]:
-    """Terms that this record could show at all."""
+    """Terms that this record could determine at all."""
     readings = fit.model.readings
-    out = ["gyroscope_cross"] if len(fit.model.rows) == 2 or fit.vps is not None else []
-    if readings.warmth is not None and float(np.ptp(readings.warmth)) > LEAST_WARMTH_DEGC:
+    out = ["gyroscope_cross"] if len(fit.model.vectors) == 2 or fit.vps is not None else []
+    if readings.warmth is not None and float(np.ptp(readings.warmth)) > LEAST_TEMPERATURE_RANGE_DEGC:
         out.append("gyroscope_temperature")
     if float(np.sqrt(np.mean(np.sum(fit.path.rate**2, axis=1)))) > LEAST_RATE_RADPS:
-        out += [f"{name}_delay" for name in fit.model.rows]
-    return out + [f"{name}_cross" for name in fit.model.rows]
+        out += [f"{name}_delay" for name in fit.model.vectors]
+    return out + [f"{name}_cross" for name in fit.model.vectors]
 
 
 def with_zeros(state: State, names: list[str]) -> State:
-    """The state with these terms free, at nothing."""
+    """The state with these terms free, at zero."""
     return replace(state, values={**state.values, **{name: np.zeros(TERMS[name]) for name in names}})
 
 
@@ -88,23 +88,25 @@ def _refitted(
 
 
 def _scores(fit: JointFit) -> dict[str, float]:
-    """χ² of each candidate's first step, all of them free and the rest following; the fit is at its optimum."""
+    """χ² of each candidate's first step, with all candidates free and the other parameters following; `fit` is at its
+    optimum."""
     names = candidates(fit)
     model, state = fit.model, with_zeros(fit.state, names)
     layout, p = layout_of(model, state.values, dip="dip" in fit.layout, lever_arm="lever_arm" in fit.layout)
-    probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.rows))
+    probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.vectors))
     normal, _, _ = linearised(model, state, fit.path, layout, p, fit.weight, fit.levels, probe, fit.vps)
     _, information, gradient = normal.eliminate()
-    own = np.concatenate([np.arange(p)[layout[name]] for name in names])
-    rest = np.setdiff1d(np.arange(p), own)
+    tested = np.concatenate([np.arange(p)[layout[name]] for name in names])
+    rest = np.setdiff1d(np.arange(p), tested)
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
     unit = information * np.outer(scale, scale)
     left = (
-        unit[np.ix_(own, own)]
-        - unit[np.ix_(own, rest)] @ np.linalg.lstsq(unit[np.ix_(rest, rest)], unit[np.ix_(rest, own)], rcond=1e-10)[0]
+        unit[np.ix_(tested, tested)]
+        - unit[np.ix_(tested, rest)]
+        @ np.linalg.lstsq(unit[np.ix_(rest, rest)], unit[np.ix_(rest, tested)], rcond=1e-10)[0]
     )
     covariance = np.linalg.pinv(left, rcond=1e-6, hermitian=True)
-    step = covariance @ (gradient[own, GRADIENT] * scale[own])
+    step = covariance @ (gradient[tested, GRADIENT] * scale[tested])
     out, at = {}, 0
     for name in names:
         these = slice(at, at + TERMS[name])
@@ -114,8 +116,8 @@ def _scores(fit: JointFit) -> dict[str, float]:
 
 
 def _gains(fit: JointFit, names: list[str]) -> dict[str, float]:
-    """Forward selection on the first part of the record, judged by the rest: gain over its sd of each term when it was
-    its turn."""
+    """Forward selection on the first part of the record, tested on the rest: gain over its sd of each term, beside the
+    terms accepted before it."""
     n = len(fit.model.readings.t)
     split = int(fit.model.knots.index[np.searchsorted(fit.model.knots.index, int(FIT_SHARE * n))])
     early, late = (_part(fit, a, b) for a, b in ((0, split + 1), (split, n)))
@@ -126,7 +128,7 @@ def _gains(fit: JointFit, names: list[str]) -> dict[str, float]:
         for name in names:
             other = _refitted(early[0], current.state, current.levels, fit, [name], early[2])
             out[name] = _gain(late[0], without, _predicted(*late, other, current))
-            if out[name] > GAIN_GATE:
+            if out[name] > LEAST_GAIN_SD:
                 current, without = other, _predicted(*late, other, other)
     except EstimationError:
         pass
@@ -144,52 +146,54 @@ def _part(fit: JointFit, a: int, b: int) -> tuple[Model, State, VpsRecord | None
     if fit.vps is None:
         return model, state, None
     vps = fit.vps.at_knots(model, state, trajectory(model, state))
-    # The record's constant rotations are found anew.
+    # The constant rotations of the VPS are aligned anew for the part.
     return model, replace(state, values={**state.values, **fit.vps.start()}), vps
 
 
 @dataclass(frozen=True)
 class _Prediction:
-    """Residuals over their sd: of readings (m, r) with robust weights, and of what ties the knots (K−1, c)."""
+    """Residuals over their sd: of readings (m, r), with their robust weights, and of the links between knots (K−1,
+    c)."""
 
     rows: Array
     weight: Array
-    ties: Array
+    links: Array
 
 
 def _predicted(model: Model, state: State, vps: VpsRecord | None, constants: JointFit, noise: JointFit) -> _Prediction:
-    """Under the constants of one fit and the noise levels of another; attitudes and translation are free."""
+    """Prediction with the constants of one fit and the noise levels of another; attitudes and translation are free."""
     levels = noise.levels
     state = replace(state, values=constants.state.values)
     reference = None
     if vps is not None and constants.vps is not None and noise.vps is not None:
         sigma = noise.vps.sigma(noise.model, noise.state)
         reference = replace(constants.vps, used=vps.used, sigma_rad=sigma)
-    own = {name: v for name, v in state.values.items() if name in TERMS or name in PARAMETERS}
-    layout, p = layout_of(model, own, dip=False, lever_arm=False)
-    probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.rows))
+    free = {name: v for name, v in state.values.items() if name in TERMS or name in PARAMETERS}
+    layout, p = layout_of(model, free, dip=False, lever_arm=False)
+    probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.vectors))
     for _ in range(PREDICT_ITERATIONS):
         path = trajectory(model, state)
         weight = robust_weight(model, residuals(model, state, path), levels)
         normal, joints, _ = linearised(model, state, path, layout, p, weight, levels, probe, reference)
         step = normal.eliminate()[0][:, :, p + GRADIENT]
         state = state.moved(step, np.zeros(p), layout)
-        if np.max(np.abs(step[:, :3])) < STEP_RAD:
+        if np.max(np.abs(step[:, :3])) < PREDICT_STEP_RAD:
             break
     path = trajectory(model, state)
     residual = residuals(model, state, path)
-    ties = whitened_joints(model.knots, replace(joints, jump=path.jump, motion=state.motion))
+    links = whitened_joints(model.knots, replace(joints, jump=path.jump, motion=state.motion))
     if reference is not None:
-        error, known = reference.residual(model, state)
-        ties = np.hstack([ties, (error * known[:, None] / reference.sigma_rad)[:-1]])
+        error, available = reference.residual(model, state)
+        links = np.hstack([links, (error * available[:, None] / reference.sigma_rad)[:-1]])
     return _Prediction(
-        residual / np.sqrt(levels.variance * levels.colour), robust_weight(model, residual, levels), ties
+        residual / np.sqrt(levels.variance * levels.colour), robust_weight(model, residual, levels), links
     )
 
 
 def _gain(model: Model, without: _Prediction, term: _Prediction) -> float:
-    """Drop of the squares d over its sd. Where the term is right d is |Δ|² + 2Δᵀe with Δ the change of the residuals
-    and e noise, so d − |Δ|² summed by blocks of BLOCK_S, longer than the noise remembers, gives the sd."""
+    """Drop d of the sum of squares over its sd. Where the term is right d is |Δ|² + 2Δᵀe with Δ the change of the
+    residuals and e noise, so d − |Δ|², summed by blocks of BLOCK_S, longer than the noise is correlated, gives the
+    sd."""
     knots = model.knots
     blocks = max(1, round(float(knots.interval_s.sum()) / BLOCK_S))
     if blocks < FEWEST_BLOCKS:
@@ -198,7 +202,7 @@ def _gain(model: Model, without: _Prediction, term: _Prediction) -> float:
     drop, changed = np.zeros(blocks), np.zeros(blocks)
     for a, b, weight, block in (
         (without.rows, term.rows, without.weight, of_knot[knots.of_sample[model.at]]),
-        (without.ties, term.ties, np.ones_like(without.ties), of_knot[:-1]),
+        (without.links, term.links, np.ones_like(without.links), of_knot[:-1]),
     ):
         drop += np.bincount(block, np.sum(weight * (a**2 - b**2), axis=1), minlength=blocks)
         changed += np.bincount(block, np.sum(weight * (a - b) ** 2, axis=1), minlength=blocks)
@@ -206,15 +210,15 @@ def _gain(model: Model, without: _Prediction, term: _Prediction) -> float:
     return float(drop.sum()) / sd if sd > 0.0 else 0.0
 
 
-def told(tests: list[TermTest], fit: JointFit) -> Mapping[str, dict[str, object]]:
-    """Plain numbers for `measured`: how each was judged and, where kept, its values and sd."""
+def summary(tests: list[TermTest], fit: JointFit) -> Mapping[str, dict[str, object]]:
+    """Plain numbers for `measured`: the test results of each term and, where kept, its values and sd."""
     out: dict[str, dict[str, object]] = {}
     for test in tests:
         out[test.name] = {"kept": test.kept, "score": test.score, "held_out_gain": test.gain}
         if test.kept:
-            own = fit.layout[test.name]
+            columns = fit.layout[test.name]
             out[test.name] |= {
                 "value": fit.state.values[test.name].tolist(),
-                "sd": np.sqrt(np.diagonal(fit.covariance)[own]).tolist(),
+                "sd": np.sqrt(np.diagonal(fit.covariance)[columns]).tolist(),
             }
     return out

@@ -1,4 +1,4 @@
-"""What the joint estimator is given and what it seeks: readings, centred triads, a record's model and its state."""
+"""The joint estimation problem: readings, triads in centred units, the model of a record, and the state to estimate."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from fieldcal.estimation.joint.chain_solver import Knots
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.geometry.rotation import Array, from_rotation_vector, multiply
 
+# Vector readings are averaged over at most this turn of the vehicle and this time.
 MAX_TURN_RAD, MAX_AVERAGE_S = 0.1, 0.02
 TRIADS = ("gyroscope", "accelerometer", "magnetometer")
 # Off-diagonal elements of a triad's matrix that are free: body axes are the accelerometer's, whose x stays where it is.
 OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 CROSS = {"gyroscope": OFF_DIAGONAL, "accelerometer": ((1, 0), (2, 0), (2, 1)), "magnetometer": OFF_DIAGONAL}
-# What a start may hold beside constants, and how many numbers that is: cross-axis terms, the gyroscope's slope with
-# temperature, delays of the vector triads behind it, s (`model_selection`); a VPS's clock and mounting
-# (`pose_measurement`).
+# Optional parameters and their sizes: cross-axis terms, the gyroscope's slope with temperature, delays of the vector
+# triads behind it, s (`model_selection`); then the clock and the mounting of a VPS (`pose_measurement`).
 TERMS = {
     "gyroscope_cross": 6,
     "gyroscope_temperature": 3,
@@ -50,20 +50,20 @@ class Readings:
     turning: Array
     warmth: Array | None = None
 
-    def part(self, own: slice) -> Readings:
-        """The samples `own` alone."""
+    def part(self, samples: slice) -> Readings:
+        """These samples alone."""
 
         def cut(x: Array | None) -> Array | None:
-            return None if x is None else x[own]
+            return None if x is None else x[samples]
 
         return replace(
             self,
-            t=self.t[own],
-            segment=self.segment[own],
-            gyroscope=self.gyroscope[own],
+            t=self.t[samples],
+            segment=self.segment[samples],
+            gyroscope=self.gyroscope[samples],
             accelerometer=cut(self.accelerometer),
             magnetometer=cut(self.magnetometer),
-            turning=self.turning[:, own],
+            turning=self.turning[:, samples],
             warmth=cut(self.warmth),
         )
 
@@ -81,24 +81,26 @@ def averaging_side(readings: Readings, rate_radps: float) -> int:
 
 @dataclass(frozen=True)
 class Centred:
-    """A triad's readings as x = (logged − centre)/spread, so that its constants (λ', b') are of order one."""
+    """A triad's readings as x = (logged − centre)/spread, so that its constants (λ', b') are of order one.
+
+    `x` (m, 3), 0 where `valid` (m,) says that there is no reading; `centre`, `spread` (3,) logged units."""
 
     x: Array
-    known: np.ndarray
+    valid: np.ndarray
     centre: Array
     spread: Array
 
     @classmethod
     def of(cls, logged: Array) -> Centred:
-        known = np.asarray(np.isfinite(logged).all(axis=1))
-        centre = logged[known].mean(axis=0)
-        spread = np.maximum(logged[known].std(axis=0), 1e-300)
-        return cls(np.where(known[:, None], (logged - centre) / spread, 0.0), known, centre, spread)
+        valid = np.asarray(np.isfinite(logged).all(axis=1))
+        centre = logged[valid].mean(axis=0)
+        spread = np.maximum(logged[valid].std(axis=0), 1e-300)
+        return cls(np.where(valid[:, None], (logged - centre) / spread, 0.0), valid, centre, spread)
 
     def averaged(self, at: np.ndarray, side: int) -> Centred:
         """At samples `at` only, each the mean of itself and `side` neighbours on either side."""
         x = sum(self.x[at + k] for k in range(-side, side + 1)) / (2 * side + 1)
-        return replace(self, x=np.asarray(x), known=self.known[at])
+        return replace(self, x=np.asarray(x), valid=self.valid[at])
 
     def scaled(self, scale: Array, bias: Array) -> Array:
         """(λ', b') (6,) of constants in logged units."""
@@ -116,30 +118,33 @@ class Centred:
 
 @dataclass(frozen=True)
 class State:
-    """Everything unknown: knot attitudes `q` (K, 4) of the sensor axes, `motion` (K, 9), and `values` by name: each
-    triad's (λ', b') (6,), `dip` (1,) rad, `lever_arm` (3,) m, sensor axes, and the `OPTIONAL` ones there are."""
+    """All unknowns: knot attitudes `q` (K, 4) of the sensor axes, `motion` (K, 9), and `values` by name: each triad's
+    (λ', b') (6,), `dip` (1,) rad, `lever_arm` (3,) m, sensor axes, and those of `OPTIONAL` that are estimated."""
 
     q: Array
     motion: Array
     values: Mapping[str, Array]
 
     def moved(self, knots: Array, theta: Array, layout: Mapping[str, slice]) -> State:
-        """After a step: knots (K, s), parameters (p,)."""
+        """The state after a step of the knots (K, s) and of the parameters θ (p,), which `layout` orders."""
         values = dict(self.values)
-        for name, own in layout.items():
-            values[name] = values[name] + theta[own]
+        for name, columns in layout.items():
+            values[name] = values[name] + theta[columns]
         return State(multiply(from_rotation_vector(knots[:, :3]), self.q), self.motion + knots[:, 3:], values)
 
 
 @dataclass(frozen=True)
 class Model:
-    """The record prepared for fitting. `rows` names the vector triads present, three residual rows each; they are
-    compared at samples `at` (m,), each triad's readings there in `triads` (the gyroscope's at every sample)."""
+    """The record prepared for fitting.
+
+    `vectors` names the vector triads present. They are compared with their prediction at the samples `at` (m,): a row
+    of the measurement model is one such sample, with three residuals for each vector triad. `triads` holds the readings
+    of the vector triads at the rows and of the gyroscope at every sample."""
 
     readings: Readings
     triads: Mapping[str, Centred]
     knots: Knots
-    rows: tuple[str, ...]
+    vectors: tuple[str, ...]
     at: np.ndarray
 
     @classmethod
@@ -147,25 +152,25 @@ class Model:
         """`side`: vector readings are averaged over that many neighbours on either side (see `averaging_side`)."""
         given = {name: getattr(readings, name) for name in TRIADS}
         triads = {name: Centred.of(x) for name, x in given.items() if x is not None and np.isfinite(x).any()}
-        rows = tuple(name for name in TRIADS[1:] if name in triads)
+        vectors = tuple(name for name in TRIADS[1:] if name in triads)
         at = np.concatenate(
             [np.arange(a + side, b - side, 2 * side + 1) for a, b in run_bounds(readings.segment) if b - a > 2 * side]
         )
-        triads = {name: x.averaged(at, side) if name in rows else x for name, x in triads.items()}
-        return cls(readings, triads, knots, rows, at)
+        triads = {name: x.averaged(at, side) if name in vectors else x for name, x in triads.items()}
+        return cls(readings, triads, knots, vectors, at)
 
     def part(self, a: int, b: int, knots: Knots) -> Model:
-        """Samples a to b alone, in the same centred units, tied at `knots`."""
+        """Samples a to b alone, in the same centred units, with `knots` placed on them."""
         rows = slice(*np.searchsorted(self.at, [a, b]))
-        own = {name: slice(a, b) if name == "gyroscope" else rows for name in self.triads}
-        triads = {name: replace(x, x=x.x[own[name]], known=x.known[own[name]]) for name, x in self.triads.items()}
-        return Model(self.readings.part(slice(a, b)), triads, knots, self.rows, self.at[rows] - a)
+        spans = {name: slice(a, b) if name == "gyroscope" else rows for name in self.triads}
+        triads = {name: replace(x, x=x.x[spans[name]], valid=x.valid[spans[name]]) for name, x in self.triads.items()}
+        return Model(self.readings.part(slice(a, b)), triads, knots, self.vectors, self.at[rows] - a)
 
     def without(self, name: str, rows: np.ndarray) -> Model:
-        """Rows (m,) of a vector triad taken for no readings."""
+        """The model without the readings of a vector triad at `rows` (m,) bool."""
         triad = self.triads[name]
-        left = replace(triad, known=triad.known & ~rows, x=np.where(rows[:, None], 0.0, triad.x))
-        return replace(self, triads={**self.triads, name: left})
+        remaining = replace(triad, valid=triad.valid & ~rows, x=np.where(rows[:, None], 0.0, triad.x))
+        return replace(self, triads={**self.triads, name: remaining})
 
     def field(self, dip: float) -> tuple[Array, Array]:
         """Local field (3,), NED, at a dip angle, rad, and its derivative."""
@@ -179,16 +184,17 @@ class Model:
         )
 
 
-def corrected(model: Model, values: Mapping[str, Array], name: str, own: slice = slice(None)) -> Array:
-    """Readings x of a triad with cross-axis terms and the slope with temperature put in, (m, 3): Λ'(I + E) x + b'."""
-    x = model.triads[name].x[own]
+def corrected(model: Model, values: Mapping[str, Array], name: str, span: slice = slice(None)) -> Array:
+    """Readings of a triad, (m, 3), with the optional terms applied to x: (I + E) x + slope × temperature; Λ' and b'
+    follow."""
+    x = model.triads[name].x[span]
     out = x
     cross = values.get(f"{name}_cross")
     if cross is not None:
         out = x + x @ off_diagonal(name, cross).T
     slope = values.get(f"{name}_temperature")
     if slope is not None and model.readings.warmth is not None:
-        out = out + model.readings.warmth[own, None] * slope
+        out = out + model.readings.warmth[span, None] * slope
     return out
 
 

@@ -1,4 +1,4 @@
-"""Noise of the joint estimate: levels found beside the fit (variance components), and readings that are not noise."""
+"""Noise of the joint estimate: levels estimated with the fit (variance components), and readings that are not noise."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ from fieldcal.estimation.segments import true_runs
 from fieldcal.estimation.statistics import robust_sigma, white_noise_sigma
 from fieldcal.geometry.rotation import Array
 
-# Residual length, sd of a three-axis reading, beyond which a reading loses influence: χ²₃ passes it once in a thousand.
-CLIP = 4.0
-# A magnetometer's readings of less weight are lost; a run of them is a field that passes, whose edges reach beyond by
-# this share of its length.
-LOST, BURST_EDGE = 0.25, 0.25
-# The translation at the start, and the gyroscope's walk there over what its sample-to-sample noise makes: loose, since
-# the start is wrong by more than noise.
-ACCELERATION_START_MPS2, WALK_START = 0.2, 10.0
-# The walk is at most this multiple of what that noise makes (a band limit hides a factor of about 4): a field that
-# varies from place to place would otherwise be taken for a gyroscope that walks.
-MOST_WALK = 10.0
-STIFFENING = 4.0
+# Length of a three-axis residual, in sd, beyond which a reading loses influence: χ²₃ exceeds it once in a thousand.
+CLIP_SD = 4.0
+# A magnetometer's readings of less weight are outliers; a run of them is a passing field, which extends beyond the run
+# by this share of its length.
+OUTLIER_WEIGHT, BURST_EDGE_SHARE = 0.25, 0.25
+# Strength of the translation at the start, and the attitude's walk there over that by the gyroscope's sample-to-sample
+# noise: loose, since the start is wrong by more than noise.
+START_ACCELERATION_MPS2, START_WALK_RATIO = 0.2, 10.0
+# The walk is at most this multiple of that by sample-to-sample noise (a band limit hides a factor of about 4): a field
+# that varies from place to place would otherwise be taken for a gyroscope whose attitude walks.
+LARGEST_WALK_RATIO = 10.0
+LARGEST_WALK_DROP = 4.0  # factor by which the walk may fall towards that bound in one iteration
 LEAST_ACCELERATION_MPS2, LEAST_WALK, LEAST_VARIANCE = 2e-3, 1e-9, 1e-8
-# Bounds of a step of a variance: the translation may vanish, the walk is what ties the attitudes.
-LEAST_RATIO, MOST_RATIO = np.array([0.25, 0.01]), np.array([4.0, 10.0])
+# Bounds of the ratio of a variance to that of the iteration before, (walk, translation): the translation may vanish,
+# the walk links the attitudes and may not.
+SMALLEST_STEP_RATIO, LARGEST_STEP_RATIO = np.array([0.25, 0.01]), np.array([4.0, 10.0])
 
 
 @dataclass(frozen=True)
 class Levels:
-    """Noise: `variance` (r,) of each sensor row a sample, units of x; `colour` (r,) its density at low frequency over
-    that of white noise of the same variance; `walk` of the attitude by gyroscope noise, rad²/s; `strength` of the
-    translation, m/s² an axis."""
+    """Noise levels: `variance` (r,) of each residual of a row, x²; `colour` (r,) its density at low frequency over that
+    of white noise of the same variance; `walk`, density of the attitude's random walk by gyroscope noise, rad²/s;
+    `strength`, stationary rms of the translation's acceleration, m/s² an axis."""
 
     variance: Array
     colour: Array
@@ -43,21 +44,22 @@ class Levels:
 
 
 def first_levels(model: Model, state: State, path: Trajectory, residual: Array) -> Levels:
-    """Levels to start from, of a start's own residuals."""
-    known = np.repeat(np.column_stack([model.triads[name].known for name in model.rows]), 3, axis=1)
-    sigma = np.array([robust_sigma(r[k]) for r, k in zip(residual.T, known.T, strict=True)])
+    """Levels to start from: those of the residuals at the start."""
+    valid = np.repeat(np.column_stack([model.triads[name].valid for name in model.vectors]), 3, axis=1)
+    sigma = np.array([robust_sigma(r[k]) for r, k in zip(residual.T, valid.T, strict=True)])
     variance = np.maximum(sigma**2, LEAST_VARIANCE)
     jumped = np.sum(path.jump**2) / (3.0 * np.sum(model.knots.interval_s * model.knots.joined))
-    walk = max(WALK_START * gyro_walk(model, state), float(jumped), LEAST_WALK)
-    strength = ACCELERATION_START_MPS2
-    if "accelerometer" in model.rows:
-        row = 3 * model.rows.index("accelerometer")
+    walk = max(START_WALK_RATIO * gyro_walk(model, state), float(jumped), LEAST_WALK)
+    strength = START_ACCELERATION_MPS2
+    if "accelerometer" in model.vectors:
+        row = 3 * model.vectors.index("accelerometer")
         strength = max(strength, float(np.max(sigma[row : row + 3] * np.abs(state.values["accelerometer"][:3]))))
     return Levels(variance, np.ones(len(variance)), walk, strength)
 
 
 def gyro_walk(model: Model, state: State) -> float:
-    """Walk of the integrated attitude, rad²/s, that the gyroscope's sample-to-sample noise makes."""
+    """Density of the random walk, rad²/s, that the gyroscope's sample-to-sample noise makes of the integrated
+    attitude."""
     noise = np.max(white_noise_sigma(model.triads["gyroscope"].x) * np.abs(state.values["gyroscope"][:3]))
     return float(noise**2 * model.knots.sample_s)
 
@@ -65,29 +67,37 @@ def gyro_walk(model: Model, state: State) -> float:
 def renewed_levels(
     model: Model, residual: Array, levels: Levels, absorbed: Array, squares: Array, sensor_walk: float
 ) -> Levels:
-    """Variance components: squares over what the unknowns leave of their number; `absorbed` (r,) by the rows of each
-    sensor axis, `squares` (2, 3) of the joints (`joint.chain_solver.joint_squares`), `sensor_walk` by `gyro_walk`."""
+    """Variance components: sums of squares over the degrees of freedom that the unknowns leave.
+
+    `absorbed` (r,) degrees of freedom of each residual that the unknowns absorb, of white noise; `squares` (2, 3) of
+    the joints (`joint.chain_solver.joint_squares`); `sensor_walk` by `gyro_walk`."""
     weight = robust_weight(model, residual, levels)
     count = weight.sum(axis=0)
     left = np.maximum(count - levels.colour * absorbed, 0.05 * count)
     variance = np.maximum(np.sum(weight * residual**2, axis=0) / left, LEAST_VARIANCE)
-    # Upwards the fixed point; downwards Newton's method, bounded: it gets to nothing where there is nothing.
+    # Upwards the fixed-point iteration; downwards Newton's method, bounded: it reaches zero where there is no such
+    # noise.
     square, free, information = np.maximum(squares.T, 1e-9)
     number = np.where(square < free, np.minimum(information, free), free)
-    ratio = np.clip(1.0 + (square - free) / number, LEAST_RATIO, MOST_RATIO)
+    ratio = np.clip(1.0 + (square - free) / number, SMALLEST_STEP_RATIO, LARGEST_STEP_RATIO)
     walk, strength = levels.walk * ratio[0], levels.strength * np.sqrt(ratio[1])
     return Levels(
         variance,
         _colour(model, residual, weight),
-        # A start that jumps is loose at first and stiffens by steps: the linear equations hold for small turns only.
-        float(np.clip(walk, LEAST_WALK, max(MOST_WALK * sensor_walk, levels.walk / STIFFENING, LEAST_WALK))),
+        # Attitudes that jump at the start are linked loosely first and more stiffly step by step: the linearisation
+        # holds for small turns only.
+        float(
+            np.clip(
+                walk, LEAST_WALK, max(LARGEST_WALK_RATIO * sensor_walk, levels.walk / LARGEST_WALK_DROP, LEAST_WALK)
+            )
+        ),
         max(float(strength), LEAST_ACCELERATION_MPS2),
     )
 
 
-def unsettled_by(before: Levels, after: Levels, squares: Array) -> float:
-    """Largest relative change of a noise variance; of walk and translation in standard deviations where one could claim
-    less than their own size."""
+def largest_level_change(before: Levels, after: Levels, squares: Array) -> float:
+    """Largest relative change of a noise variance; of walk and translation in units of their sd where that is larger
+    than the level itself."""
     old, new = (np.r_[v.variance, v.walk, v.strength**2] for v in (before, after))
     change = np.abs(new / old - 1.0)
     change[-2:] *= np.minimum(1.0, np.sqrt(0.5 * squares[:, 2]))
@@ -95,41 +105,43 @@ def unsettled_by(before: Levels, after: Levels, squares: Array) -> float:
 
 
 def robust_weight(model: Model, residual: Array, levels: Levels) -> Array:
-    """Redescending weights (m, r): 1 up to CLIP standard deviations of the reading, (CLIP/d)⁴ beyond, 0 for none.
+    """Redescending weights (m, r): 1 up to a residual of d = CLIP_SD standard deviations, (CLIP_SD/d)⁴ beyond, 0 where
+    there is no reading.
 
-    With the square alone a wrong reading adds CLIP² to its variance, however far off, and six in a hundred of them
-    inflate that until none is an outlier. A magnetometer's d is of the reading alone or of the mean over an interval,
-    which shows the edges of a burst; what an accelerometer has in common over one is translation."""
+    With (CLIP_SD/d)² a wrong reading would add CLIP_SD² to its variance, however far off, and six in a hundred of them
+    would inflate that until none is an outlier. A magnetometer's d is the larger one of the reading alone and of the
+    mean over an interval, which shows the edges of a burst; an accelerometer's common part over an interval is
+    translation."""
     out = np.empty_like(residual)
     together = max(1, len(residual) // len(model.knots.index))
-    for i, name in enumerate(model.rows):
+    for i, name in enumerate(model.vectors):
         row = slice(3 * i, 3 * i + 3)
         square = np.sum(residual[:, row] ** 2 / levels.variance[row], axis=1)
         if name == "magnetometer":
             mean = uniform_filter1d(residual[:, row], together, axis=0)
             square = np.maximum(square, np.sum(mean**2 * together / (levels.variance * levels.colour)[row], axis=1))
-        weight = np.minimum(1.0, CLIP**2 / np.maximum(square, 1e-12)) ** 2 * model.triads[name].known
+        weight = np.minimum(1.0, CLIP_SD**2 / np.maximum(square, 1e-12)) ** 2 * model.triads[name].valid
         out[:, row] = weight[:, None]
     return out
 
 
 def passing_fields(model: Model, weight: Array) -> np.ndarray:
-    """Magnetometer rows (m,) of fields that pass: runs of lost readings and BURST_EDGE of their length on either side,
-    since a field rises out of the noise, and falls back into it, no faster than it stays above."""
-    rows = model.rows
-    if "magnetometer" not in rows:
+    """Rows (m,) at which the magnetometer reads a passing field: runs of outliers and BURST_EDGE_SHARE of their length
+    on either side, since a field rises out of the noise and falls back into it within a time like that above it."""
+    vectors = model.vectors
+    if "magnetometer" not in vectors:
         return np.zeros(len(model.at), dtype=bool)
-    known = model.triads["magnetometer"].known
-    lost = known & (weight[:, 3 * rows.index("magnetometer")] < LOST)
-    first, past = true_runs(lost)
-    reach = (BURST_EDGE * (past - first)).astype(int)
-    first, past = np.maximum(first - reach, 0)[reach > 0], np.minimum(past + reach, len(lost))[reach > 0]
-    change = np.bincount(first, minlength=len(lost) + 1) - np.bincount(past, minlength=len(lost) + 1)
-    return np.asarray(known & (np.cumsum(change)[:-1] > 0))
+    valid = model.triads["magnetometer"].valid
+    outlier = valid & (weight[:, 3 * vectors.index("magnetometer")] < OUTLIER_WEIGHT)
+    start, stop = true_runs(outlier)
+    reach = (BURST_EDGE_SHARE * (stop - start)).astype(int)
+    start, stop = np.maximum(start - reach, 0)[reach > 0], np.minimum(stop + reach, len(outlier))[reach > 0]
+    change = np.bincount(start, minlength=len(outlier) + 1) - np.bincount(stop, minlength=len(outlier) + 1)
+    return np.asarray(valid & (np.cumsum(change)[:-1] > 0))
 
 
 def _colour(model: Model, residual: Array, weight: Array) -> Array:
-    """Density at low frequency over the white one, (r,): from the autocorrelation within half an interval."""
+    """Density at low frequency over that of white noise, (r,): from the autocorrelation within half an interval."""
     lags = int(np.clip(len(residual) / len(model.knots.index) / 2, 1, 8))
     x = residual * np.sqrt(weight)
     zero = np.maximum(np.sum(x * x, axis=0), 1e-300)

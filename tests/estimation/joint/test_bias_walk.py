@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.optimize import minimize
 
-from fieldcal.estimation.joint.bias_walk import SLOWEST, bias_walk
+from fieldcal.estimation.joint.bias_walk import COEFFICIENTS, bias_walk
 
 WALK = 2e-3  # rad/s/√s
 NOISE = 0.0133  # rad/√s, of the rate
@@ -24,7 +24,7 @@ def rates(seed: int, n: int, step_s: float, *, walk: float = WALK, noise: float 
 def test_it_is_the_maximum_of_the_likelihood_written_out() -> None:
     """So few steps, of half the shortest period, that every coefficient counts: dense covariance, contrasts free of the
     mean."""
-    n, step_s = SLOWEST + 1, 2.0
+    n, step_s = COEFFICIENTS + 1, 2.0
     own = null_space(np.ones((1, n)))
     covariance = np.minimum.outer(np.arange(n), np.arange(n)) * step_s
     for seed in range(5):

@@ -203,7 +203,7 @@ def test_what_is_beyond_the_model_widens_the_sd() -> None:
 def test_a_passing_field_is_left_out_with_its_edges() -> None:
     r, still = (simulate(seed=7, magnetic_bursts=bursts, **MOVING) for bursts in (4, 0))
     fit = fitted(r)
-    known = fit.model.triads["magnetometer"].known
+    known = fit.model.triads["magnetometer"].valid
     scale = np.asarray(r.experiment.scale["magnetometer"])
     passing = np.linalg.norm((r.counts["magnetometer"] - still.counts["magnetometer"]) * scale, axis=1)[fit.model.at]
     # The field is 1, a reading's noise 0.006.

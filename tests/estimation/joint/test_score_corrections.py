@@ -16,7 +16,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from fieldcal.estimation.gyroscope.output_error import propagate_stretches
 from fieldcal.estimation.joint.chain_solver import BRIDGE, GRADIENT, MOTION_HZ, Probe, place_knots
 from fieldcal.estimation.joint.fit import linearised
-from fieldcal.estimation.joint.initialise import SPACING_S, turning
+from fieldcal.estimation.joint.initialise import KNOT_SPACING_S, turning
 from fieldcal.estimation.joint.measurement_model import layout_of, residuals, trajectory, translation
 from fieldcal.estimation.joint.problem import TRIADS, Model, Readings, State
 from fieldcal.estimation.joint.score_corrections import logged_units, within_intervals
@@ -71,10 +71,10 @@ class Flight:
             field_ned=FIELD_NED,
             turning=turning(t, segment, logged["gyroscope"]),
         )
-        knots = place_knots(t, segment, SPACING_S)
+        knots = place_knots(t, segment, KNOT_SPACING_S)
         model = Model.of(given, knots, side=AVERAGED // 2)
         triads = {name: replace(own, x=(logged[name] - own.centre) / own.spread) for name, own in model.triads.items()}
-        rows = {name: replace(triads[name], x=triads[name].x[model.at]) for name in model.rows}
+        rows = {name: replace(triads[name], x=triads[name].x[model.at]) for name in model.vectors}
         model = replace(model, triads={**triads, **rows})
         values = {name: triads[name].scaled(np.array(SCALE[name]), np.zeros(3)) for name in TRIADS}
         state = State(
@@ -84,8 +84,8 @@ class Flight:
         )
         sigma = {name: float(np.sqrt(variance)) for name, variance in NOISE_VARIANCE.items()}
         sigma["gyroscope"] *= gyro_noise
-        sigma |= {name: sigma[name] / np.sqrt(AVERAGED) for name in model.rows}
-        variance = np.concatenate([(sigma[name] / values[name][:3]) ** 2 for name in model.rows])
+        sigma |= {name: sigma[name] / np.sqrt(AVERAGED) for name in model.vectors}
+        variance = np.concatenate([(sigma[name] / values[name][:3]) ** 2 for name in model.vectors])
         walk = sigma["gyroscope"] ** 2 / RATE_HZ
         levels = Levels(variance, np.ones(len(variance)), walk, float(np.sqrt(np.mean(strength_mps2**2))))
         return cls(model, state, levels, sigma, strength_mps2)
@@ -163,7 +163,7 @@ def biases(flight: Flight, pairs: int) -> tuple[Array, Array, Array]:
     rng, model = np.random.default_rng(2), flight.model
     gradient, added = [], []
     for pair in range(pairs):
-        probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.rows), seed=pair)
+        probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.vectors), seed=pair)
         both = [scores(flight, *drawn, probe) for drawn in flight.drawn(rng)]
         gradient.append(0.5 * (both[0][0] + both[1][0]))
         added.append(0.5 * (both[0][1] + both[1][1]))
