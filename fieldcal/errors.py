@@ -9,13 +9,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from fieldcal.reason_codes import ReasonCode
+
 
 class FieldcalError(Exception):
     """Base of every error fieldcal raises on purpose.
 
     Parameters
     ----------
-    reason_code : str
+    reason_code : ReasonCode
         Short stable identifier, stored in tables (`too_little_motion`, `format_not_supported`, ...).
     sentence : str
         What happened and what to do next.
@@ -23,7 +25,7 @@ class FieldcalError(Exception):
         The numbers that decided it.
     """
 
-    def __init__(self, reason_code: str, sentence: str, measured: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, reason_code: ReasonCode, sentence: str, measured: Mapping[str, Any] | None = None) -> None:
         super().__init__(sentence)
         self.reason_code = reason_code
         self.sentence = sentence

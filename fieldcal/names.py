@@ -38,6 +38,80 @@ class Approach(StrEnum):
     """Everything in one likelihood."""
 
 
+class Method(StrEnum):
+    """The estimator that a row of the history comes from."""
+
+    JOINT = "joint"
+    OUTPUT_ERROR = "output_error"
+    EQUATION_ERROR = "equation_error"
+    ELLIPSOID_ROBUST = "ellipsoid_robust"
+    ELLIPSOID = "ellipsoid"
+    ELLIPSOID_FULL = "ellipsoid_full"
+    ELLIPSOID_TWO_STEP = "ellipsoid_two_step"
+    ELLIPSOID_TLS = "ellipsoid_tls"
+    WARM_UP = "warm_up"
+
+
+PREFERRED_METHODS = (
+    Method.JOINT,
+    Method.OUTPUT_ERROR,
+    Method.ELLIPSOID_ROBUST,
+    Method.ELLIPSOID,
+    Method.EQUATION_ERROR,
+)
+"""Of several estimates of one constant the most exact counts: this order, those not named last."""
+
+
+class Status(StrEnum):
+    """How a stage, or a row that it wrote, ended."""
+
+    OK = "ok"
+    REFUSED = "refused"
+    """The recording does not determine it."""
+    ABSENT = "absent"
+    """There is nothing to do."""
+    FAILED = "failed"
+    """An error of fieldcal's own."""
+
+
+class Verdict(StrEnum):
+    """What a log is good for."""
+
+    OK = "ok"
+    PARTIAL = "partial"
+    """Something is missing of it; the rest counts."""
+    QUARANTINED = "quarantined"
+    """It contradicts itself; nothing of it is published."""
+    REJECTED = "rejected"
+    """Nothing of it can be read."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether stages run on it."""
+        return self in (Verdict.OK, Verdict.PARTIAL)
+
+
+class DriftStatus(StrEnum):
+    """What the history says of a constant."""
+
+    STABLE = "stable"
+    DRIFTING = "drifting"
+    STEP = "step"
+    OUTLIER = "outlier"
+    """Unlike the rest of the fleet."""
+    INSUFFICIENT = "insufficient"
+    """Too few sessions for a trend."""
+
+
+GRAVEST_FIRST = (
+    DriftStatus.STEP,
+    DriftStatus.DRIFTING,
+    DriftStatus.OUTLIER,
+    DriftStatus.STABLE,
+    DriftStatus.INSUFFICIENT,
+)
+
+
 World = Literal["ned", "enu"]
 Body = Literal["frd", "flu"]
 GravitySign = Literal["gravity", "specific_force"]

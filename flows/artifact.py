@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fieldcal.batch.outcome import VERDICTS
+from fieldcal.names import Verdict
 from fieldcal.trends.changes import Change
 
 KEY = "fieldcal-night"
@@ -19,7 +19,7 @@ def keep_artifact(result: Mapping[str, Any], root: Path) -> None:
     """Keep the logs that are not `ok` or refused something, under the night's counts. A lost server is no error."""
     from prefect.artifacts import create_table_artifact
 
-    counts = ", ".join(f"{result[verdict]} {verdict}" for verdict in VERDICTS)
+    counts = ", ".join(f"{result[verdict]} {verdict}" for verdict in Verdict)
     news = [
         {"log": change["vehicle_id"], "what": change["kind"], "why": change["sentence"]} for change in result["changes"]
     ]
@@ -39,7 +39,7 @@ def keep_artifact(result: Mapping[str, Any], root: Path) -> None:
 
 
 def _rows(log: Mapping[str, Any]) -> list[dict[str, Any]]:
-    own = [] if log["verdict"] == "ok" else [{"what": log["verdict"], "why": log["reason"] or log["reason_code"]}]
+    own = [] if log["verdict"] == Verdict.OK else [{"what": log["verdict"], "why": log["reason"] or log["reason_code"]}]
     refused = [{"what": f"{r['stage']} {r['status']}", "why": r["reason"] or r["reason_code"]} for r in log["refusals"]]
     return [{"log": log["log_uri"], **row} for row in own + refused]
 

@@ -18,6 +18,7 @@ from fieldcal.batch.landing import Landing
 from fieldcal.errors import FieldcalError
 from fieldcal.flows.nightly import nightly, session
 from fieldcal.flows.trigger import DEPLOYMENT, EVENT, trigger
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.words.talk import say
 
 AT_ONCE = 2
@@ -32,7 +33,7 @@ def session_landed(folder: str) -> str:
     """
     url = PREFECT_API_URL.value()
     if url is None or not Path(folder).is_dir():
-        raise FieldcalError("no_session", f"There is no session folder at {folder}, which the event names.")
+        raise FieldcalError(ReasonCode.NO_SESSION, f"There is no session folder at {folder}, which the event names.")
     return str(trigger(url, Path(folder).absolute())["flow_run_id"])
 
 

@@ -13,6 +13,7 @@ from typing import Any
 from uuid import uuid4
 
 from fieldcal.errors import FieldcalError
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 
@@ -41,7 +42,7 @@ def pool_answers(inputs: Sequence[dict[str, Any]]) -> Iterator[tuple[dict[str, A
             deployment = client.read_deployment_by_name(BATCH_DEPLOYMENT)
         except ObjectNotFound as error:
             what = f"The server has no deployment {BATCH_DEPLOYMENT}: run `prefect deploy --all` (prefect.yaml)."
-            raise FieldcalError("no_deployment", what) from error
+            raise FieldcalError(ReasonCode.NO_DEPLOYMENT, what) from error
         waiting: dict[Any, tuple[dict[str, Any], str]] = {}
         for given in inputs:
             name = uuid4().hex
@@ -61,7 +62,7 @@ def _taken(root: Path, name: str, state: str | None) -> dict[str, Any] | Excepti
     try:
         answer = unseal(place.read_bytes())
     except (OSError, BrokenSeal):
-        return FieldcalError("batch_lost", f"its flow run ended as {state} and left no answer")
+        return FieldcalError(ReasonCode.BATCH_LOST, f"its flow run ended as {state} and left no answer")
     place.unlink(missing_ok=True)
     return answer
 

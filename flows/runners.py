@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from fieldcal.errors import FieldcalError
 from fieldcal.flight.job import Job
+from fieldcal.reason_codes import ReasonCode
 
 if TYPE_CHECKING:
     from prefect import Task
@@ -38,7 +39,9 @@ class Parallel:
 
     def __post_init__(self) -> None:
         if self.runner not in RUNNERS:
-            raise FieldcalError("wrong_option", f"runner must be one of {', '.join(RUNNERS)}, not {self.runner!r}.")
+            raise FieldcalError(
+                ReasonCode.WRONG_OPTION, f"runner must be one of {', '.join(RUNNERS)}, not {self.runner!r}."
+            )
 
     def in_this_process(self, n_batches: int) -> bool:
         """Whether other processes would only cost."""
@@ -92,12 +95,12 @@ def _dask(parallel: Parallel) -> TaskRunner[Any]:
         from distributed import Client
         from prefect_dask.task_runners import DaskTaskRunner
     except ImportError as error:
-        raise FieldcalError("no_dask", 'Dask is not installed: pip install "fieldcal[dask]".') from error
+        raise FieldcalError(ReasonCode.NO_DASK, 'Dask is not installed: pip install "fieldcal[dask]".') from error
     if parallel.scheduler is None:
         return DaskTaskRunner(cluster_kwargs={"n_workers": parallel.workers, "threads_per_worker": 1})
     try:
         Client(parallel.scheduler, timeout="10s").close()  # type: ignore[no-untyped-call]
     except (OSError, TimeoutError, ValueError) as error:
         what = f"No Dask scheduler answers at {parallel.scheduler} ({error}). Start it, or mend --scheduler."
-        raise FieldcalError("no_scheduler", what) from error
+        raise FieldcalError(ReasonCode.NO_SCHEDULER, what) from error
     return DaskTaskRunner(address=parallel.scheduler)

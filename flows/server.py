@@ -24,6 +24,7 @@ from typing import Any, Self
 import fieldcal
 from fieldcal.errors import FieldcalError
 from fieldcal.file_locks import fcntl
+from fieldcal.reason_codes import ReasonCode
 
 START_TIMEOUT_S = 180.0
 ANSWER_TIMEOUT_S = 5.0
@@ -124,10 +125,11 @@ class Server:
         while not answers(self._url):
             if self._process is not None and self._process.poll() is not None:
                 raise FieldcalError(
-                    "prefect_unavailable", f"The Prefect server could not start; see {self._home / 'server.log'}."
+                    ReasonCode.PREFECT_UNAVAILABLE,
+                    f"The Prefect server could not start; see {self._home / 'server.log'}.",
                 )
             if time.monotonic() > give_up:
-                raise FieldcalError("prefect_unavailable", self._silence())
+                raise FieldcalError(ReasonCode.PREFECT_UNAVAILABLE, self._silence())
             time.sleep(0.05)
         if self._process is not None:
             record = {"url": self._url, "pid": self._process.pid}

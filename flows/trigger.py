@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from fieldcal.errors import FieldcalError
 from fieldcal.flows.server import answers, no_answer, serving_address
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse.files import file_sha256
 
 if TYPE_CHECKING:
@@ -43,12 +44,12 @@ def server_address(root: Path) -> str:
     """
     if url := os.environ.get("PREFECT_API_URL"):
         if not answers(url):
-            raise FieldcalError("prefect_unavailable", no_answer(url))
+            raise FieldcalError(ReasonCode.PREFECT_UNAVAILABLE, no_answer(url))
         return url
     own = serving_address(root)
     if own is None or not answers(own):
         raise FieldcalError(
-            "prefect_unavailable",
+            ReasonCode.PREFECT_UNAVAILABLE,
             f"No server runs for the warehouse {root}: start `fieldcal serve`, or set PREFECT_API_URL. The session is "
             "not lost: the next night takes it, and `fieldcal session` runs it now.",
         )
@@ -80,7 +81,7 @@ def trigger(url: str, folder: Path, **changes: Any) -> dict[str, Any]:
             deployment = client.read_deployment_by_name(f"session/{DEPLOYMENT}")
         except ObjectNotFound as error:
             raise FieldcalError(
-                "no_deployment",
+                ReasonCode.NO_DEPLOYMENT,
                 f"The server at {url} has no deployment session/{DEPLOYMENT}: start `fieldcal serve` there, or deploy "
                 "prefect.yaml.",
             ) from error
@@ -103,4 +104,6 @@ def _run_for(
             continue
         run = client.create_flow_run_from_deployment(deployment, parameters=parameters, idempotency_key=key)
         return run, not before
-    raise FieldcalError("session_fails", f"{MOST_TRIES} runs of this session failed; look at them on the server.")
+    raise FieldcalError(
+        ReasonCode.SESSION_FAILS, f"{MOST_TRIES} runs of this session failed; look at them on the server."
+    )

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fieldcal.errors import FieldcalError
+from fieldcal.reason_codes import ReasonCode
 
 
 class WarehouseError(FieldcalError):
@@ -15,25 +16,37 @@ class WarehouseError(FieldcalError):
 
 
 _KNOWN = {
-    errno.ENOSPC: ("disk_full", "the disk is full; free some space"),
-    errno.EDQUOT: ("disk_full", "the disk quota is used up; free some space"),
-    errno.EFBIG: ("disk_full", "files of this size are not allowed here; raise `ulimit -f` or free some space"),
-    errno.EROFS: ("read_only", "the file system is read-only; remount it or name another --warehouse"),
+    errno.ENOSPC: (ReasonCode.DISK_FULL, "the disk is full; free some space"),
+    errno.EDQUOT: (ReasonCode.DISK_FULL, "the disk quota is used up; free some space"),
+    errno.EFBIG: (
+        ReasonCode.DISK_FULL,
+        "files of this size are not allowed here; raise `ulimit -f` or free some space",
+    ),
+    errno.EROFS: (ReasonCode.READ_ONLY, "the file system is read-only; remount it or name another --warehouse"),
     errno.EACCES: (
-        "permission_denied",
+        ReasonCode.PERMISSION_DENIED,
         "permission is denied; give this user the right to it or name another --warehouse",
     ),
     errno.EPERM: (
-        "permission_denied",
+        ReasonCode.PERMISSION_DENIED,
         "permission is denied; give this user the right to it or name another --warehouse",
     ),
-    errno.ENOENT: ("missing_file", "it is not there"),
-    errno.ENOTDIR: ("not_a_folder", "a file stands where a folder is needed; move it or name another --warehouse"),
-    errno.EEXIST: ("not_a_folder", "a file stands where a folder is needed; move it or name another --warehouse"),
-    errno.EISDIR: ("not_a_file", "a folder stands where a file is needed; move it"),
-    errno.ELOOP: ("link_loop", "its links lead in a circle; remove them"),
-    errno.ENAMETOOLONG: ("name_too_long", "its name is too long for this file system; name another --warehouse"),
-    errno.EMFILE: ("too_many_files", "too many files are open; raise `ulimit -n`"),
+    errno.ENOENT: (ReasonCode.MISSING_FILE, "it is not there"),
+    errno.ENOTDIR: (
+        ReasonCode.NOT_A_FOLDER,
+        "a file stands where a folder is needed; move it or name another --warehouse",
+    ),
+    errno.EEXIST: (
+        ReasonCode.NOT_A_FOLDER,
+        "a file stands where a folder is needed; move it or name another --warehouse",
+    ),
+    errno.EISDIR: (ReasonCode.NOT_A_FILE, "a folder stands where a file is needed; move it"),
+    errno.ELOOP: (ReasonCode.LINK_LOOP, "its links lead in a circle; remove them"),
+    errno.ENAMETOOLONG: (
+        ReasonCode.NAME_TOO_LONG,
+        "its name is too long for this file system; name another --warehouse",
+    ),
+    errno.EMFILE: (ReasonCode.TOO_MANY_FILES, "too many files are open; raise `ulimit -n`"),
 }
 
 
@@ -43,5 +56,5 @@ def disk(path: Path, action: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason_code, need = _KNOWN.get(error.errno or 0, ("disk_error", f"{error.strerror or error}"))
+        reason_code, need = _KNOWN.get(error.errno or 0, (ReasonCode.DISK_ERROR, f"{error.strerror or error}"))
         raise WarehouseError(reason_code, f"{path} cannot be {action}: {need}.") from error

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fieldcal.file_locks import fcntl
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.layout import lock_path, prepare
 
@@ -45,7 +46,7 @@ def _lock(root: Path, path: Path, doing: str, timeout_s: float) -> Iterator[None
         while not _locked(descriptor, path):
             if time.monotonic() >= give_up:
                 what = f"another process has been {doing} for {timeout_s:g} s ({path}); try later."
-                raise WarehouseError("busy", what)
+                raise WarehouseError(ReasonCode.BUSY, what)
             time.sleep(_RETRY_S)
         yield
     finally:

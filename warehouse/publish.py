@@ -10,6 +10,7 @@ from pathlib import Path
 import polars as pl
 
 from fieldcal import schemas
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import HISTORY_TABLES, SchemaMismatch
 from fieldcal.warehouse import checksums
 from fieldcal.warehouse.errors import WarehouseError, disk
@@ -109,7 +110,7 @@ def _existing(root: Path, path: Path, table: str) -> tuple[bytes | None, pl.Data
         data = path.read_bytes()
     if problem := checksums.problem(root, path, hashlib.sha256(data).hexdigest()):
         raise WarehouseError(
-            "damaged_file",
+            ReasonCode.DAMAGED_FILE,
             f"{path} is damaged ({problem}), and nothing is published over it. Restore it, or remove it and "
             f"{checksum_path(root, path)} and run the night again: the flights are calibrated anew.",
         )

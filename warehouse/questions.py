@@ -8,6 +8,7 @@ from pathlib import Path
 import polars as pl
 
 from fieldcal.errors import FieldcalError
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse import Warehouse, WarehouseError
 
 COLUMNS = (
@@ -58,7 +59,7 @@ def existing(root: Path) -> Warehouse:
     """
     if not root.is_dir():
         raise WarehouseError(
-            "no_warehouse", f"There is no warehouse at {root}; run `fieldcal nightly` or give --warehouse."
+            ReasonCode.NO_WAREHOUSE, f"There is no warehouse at {root}; run `fieldcal nightly` or give --warehouse."
         )
     return Warehouse(root)
 
@@ -74,5 +75,7 @@ def moment_of(option: str, text: str) -> datetime:
     try:
         moment = datetime.fromisoformat(text)
     except ValueError as error:
-        raise FieldcalError("wrong_option", f'{option} needs a date such as 2026-05-04, not "{text}".') from error
+        raise FieldcalError(
+            ReasonCode.WRONG_OPTION, f'{option} needs a date such as 2026-05-04, not "{text}".'
+        ) from error
     return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)

@@ -17,6 +17,7 @@ import polars as pl
 import pyarrow as pa
 
 from fieldcal import schemas
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import HISTORY_TABLES
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.layout import history_files, vehicle_of
@@ -137,7 +138,7 @@ def _one_reading_statement(connection: duckdb.DuckDBPyConnection, query: str) ->
         return statements[0]
     what = "nothing" if not kinds else ", ".join(kinds)
     raise WarehouseError(
-        "sql_refused", f"Only a single SELECT is answered here; this is {what}. The tables are read-only."
+        ReasonCode.SQL_REFUSED, f"Only a single SELECT is answered here; this is {what}. The tables are read-only."
     )
 
 
@@ -149,7 +150,7 @@ def _result(answer: duckdb.DuckDBPyRelation, max_result_mb: int) -> pl.DataFrame
         size += batch.nbytes
         if size > max_result_mb << 20:
             raise WarehouseError(
-                "sql_too_large", f"The result is larger than {max_result_mb} MB; aggregate it or add a LIMIT."
+                ReasonCode.SQL_TOO_LARGE, f"The result is larger than {max_result_mb} MB; aggregate it or add a LIMIT."
             )
         batches.append(batch)
     return frame(pa.Table.from_batches(batches, schema=reader.schema))
@@ -172,14 +173,18 @@ def _sentences(timeout_s: float, memory_mb: int) -> Iterator[None]:
     try:
         yield
     except duckdb.InterruptException as error:
-        raise WarehouseError("sql_timeout", f"The query took longer than {timeout_s:g} s and was stopped.") from error
+        raise WarehouseError(
+            ReasonCode.SQL_TIMEOUT, f"The query took longer than {timeout_s:g} s and was stopped."
+        ) from error
     except duckdb.OutOfMemoryException as error:
         raise WarehouseError(
-            "sql_too_large", f"The query needs more than {memory_mb} MB; narrow it, for instance by vehicle_id."
+            ReasonCode.SQL_TOO_LARGE,
+            f"The query needs more than {memory_mb} MB; narrow it, for instance by vehicle_id.",
         ) from error
     except duckdb.PermissionException as error:
         raise WarehouseError(
-            "sql_refused", "Files and extensions are out of reach of SQL here: it reads the warehouse's tables only."
+            ReasonCode.SQL_REFUSED,
+            "Files and extensions are out of reach of SQL here: it reads the warehouse's tables only.",
         ) from error
     except duckdb.Error as error:
-        raise WarehouseError("sql_wrong", f"The query cannot be answered: {str(error).strip()}") from error
+        raise WarehouseError(ReasonCode.SQL_WRONG, f"The query cannot be answered: {str(error).strip()}") from error

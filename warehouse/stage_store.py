@@ -13,6 +13,7 @@ from typing import Any
 
 import polars as pl
 
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import prepare, stage_folder
@@ -97,13 +98,13 @@ class StageStore:
         record = _record(folder, stage, flight_id, run_key)
         if record is None:
             raise WarehouseError(
-                "stage_incomplete", f"{folder} holds no complete result of stage {stage}; run it again."
+                ReasonCode.STAGE_INCOMPLETE, f"{folder} holds no complete result of stage {stage}; run it again."
             )
         outputs = record["outputs"]
         wanted = list(outputs if tables is None else tables)
         if absent := [table for table in wanted if table not in outputs]:
             raise WarehouseError(
-                "stage_incomplete", f"stage {stage} of this run wrote no table {absent[0]} ({folder})."
+                ReasonCode.STAGE_INCOMPLETE, f"stage {stage} of this run wrote no table {absent[0]} ({folder})."
             )
         return {table: _output(folder, table, outputs[table]) for table in wanted}
 
@@ -142,5 +143,5 @@ def _output(folder: Path, table: str, output: Mapping[str, Any]) -> pl.DataFrame
     with disk(path, "read"):
         data = path.read_bytes()
     if hashlib.sha256(data).hexdigest() != output["sha256"]:
-        raise WarehouseError("stage_incomplete", f"{path} is not what the stage wrote; run the stage again.")
+        raise WarehouseError(ReasonCode.STAGE_INCOMPLETE, f"{path} is not what the stage wrote; run the stage again.")
     return frame(read_arrow(data, table, stage=True, name=str(path)))

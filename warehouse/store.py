@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fieldcal import schemas
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import SchemaMismatch
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import AroundRename, AtomicFile
@@ -174,11 +175,11 @@ def read_arrow(source: Path | bytes, table: str, *, stage: bool = False, name: s
             rows.validate(full=True)
             return rows
     except SchemaMismatch as error:
-        raise WarehouseError("schema_mismatch", f"{shown}: {error}.") from error
+        raise WarehouseError(ReasonCode.SCHEMA_MISMATCH, f"{shown}: {error}.") from error
     except (pa.ArrowException, OSError, ValueError) as error:
         first_line = (str(error).splitlines() or [type(error).__name__])[0]
         raise WarehouseError(
-            "damaged_file", f"{shown} is damaged ({first_line}); `fieldcal verify` lists what else is."
+            ReasonCode.DAMAGED_FILE, f"{shown} is damaged ({first_line}); `fieldcal verify` lists what else is."
         ) from error
 
 

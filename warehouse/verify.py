@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fieldcal.errors import FieldcalError
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse import checksums
 from fieldcal.warehouse.content import content_sha256
 from fieldcal.warehouse.errors import WarehouseError, disk
@@ -45,7 +46,7 @@ def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path],
     """
     if not root.is_dir():
         raise WarehouseError(
-            "no_warehouse", f"There is no warehouse at {root}; run `fieldcal nightly` or give --warehouse."
+            ReasonCode.NO_WAREHOUSE, f"There is no warehouse at {root}; run `fieldcal nightly` or give --warehouse."
         )
     found = [*_recorded_files(root), *_stage_files(root), *_night_files(root)]
     if archive is not None:

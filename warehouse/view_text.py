@@ -1,12 +1,19 @@
-"""The text of a view: its SQL file with the numbers put in that the code uses too."""
+"""The text of a view: its SQL file with the numbers and the order of methods put in that the code uses too."""
 
 from __future__ import annotations
 
 from importlib.resources import files
 
+from fieldcal.names import PREFERRED_METHODS
 from fieldcal.schemas.reference import REFERENCE_DEGC, UNCONFIRMED_SD
 
-VALUES = {"reference_degc": f"{REFERENCE_DEGC:g}", "unconfirmed_sd": f"{UNCONFIRMED_SD:g}"}
+VALUES = {
+    "reference_degc": f"{REFERENCE_DEGC:g}",
+    "unconfirmed_sd": f"{UNCONFIRMED_SD:g}",
+    "exactness": " ".join(
+        f"WHEN '{method}' THEN {len(PREFERRED_METHODS) - place}" for place, method in enumerate(PREFERRED_METHODS)
+    ),
+}
 """What stands for each `{name}` in the files of `views/`."""
 
 

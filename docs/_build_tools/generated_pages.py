@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ import fieldcal.logs.interface
 import fieldcal.warehouse.query
 from fieldcal.cli.main import app as command_line
 from fieldcal.config.parameters import PROFILES, Parameters
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.dictionary import data_dictionary
 
 FOLDER = "reference/generated"
@@ -93,12 +95,24 @@ def _directive(public: object) -> str:
     return "autofunction" if callable(public) else "autodata"
 
 
+def reason_codes() -> str:
+    """Every reason code with its meaning: its members' own docstrings."""
+    lines = ["# Reason codes", "", "What stands as `reason_code` of a row or error, and as code of a finding or fault."]
+    source = Path(inspect.getsourcefile(ReasonCode) or "").read_text(encoding="utf-8")
+    for part in re.split(r"^    # --- ", source, flags=re.MULTILINE)[1:]:
+        heading, _, members = part.partition("\n")
+        lines += ["", f"## {heading[0].upper()}{heading[1:]}", "", "| code | meaning |", "|---|---|"]
+        lines += [f"| `{c}` | {what} |" for c, what in re.findall(r'= "(\w+)"\n    """(.*)"""', members)]
+    return "\n".join(lines) + "\n"
+
+
 PAGES = {
     "tables": tables,
     "command-line": commands,
     "conventions": conventions,
     "parameters": parameters,
     "python": python,
+    "reason-codes": reason_codes,
 }
 
 

@@ -16,10 +16,10 @@ from fieldcal.flight.job import Job
 from fieldcal.flight.rows import judged, refusals
 from fieldcal.flight.versions import versions
 from fieldcal.logs import ingest
+from fieldcal.names import Status, Verdict
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.pipeline import INGEST
 from fieldcal.warehouse import Warehouse
-
-VERDICTS = ("ok", "partial", "quarantined", "rejected")
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,8 @@ def cause(why: Mapping[str, str | None]) -> str:
 def failed_outcome(job: Job, records: Mapping[str, Record], step: str, reason: str) -> Outcome:
     """Of a flight that something unforeseen stopped at `step`."""
     record = {
-        "status": "failed",
-        "reason_code": "stage_failed",
+        "status": Status.FAILED,
+        "reason_code": ReasonCode.STAGE_FAILED,
         "reason": reason,
         "measured": {},
         "versions": versions(),
@@ -97,7 +97,7 @@ def failed_outcome(job: Job, records: Mapping[str, Record], step: str, reason: s
         "outputs": {},
     }
     if INGEST not in records:
-        record |= {"facts": ingest.rejected("ingest_failed", reason), "signals": {}}
+        record |= {"facts": ingest.rejected(ReasonCode.INGEST_FAILED, reason), "signals": {}}
         step = INGEST
     return Outcome(job, {**records, step: record}, ran=(step,))
 
@@ -113,7 +113,7 @@ def summary(
     logs = [entries[log_uri] for log_uri in sorted(entries)]
     counts = Counter(entry["verdict"] for entry in logs)
     return {
-        **{verdict: counts[verdict] for verdict in VERDICTS},
+        **{verdict: counts[verdict] for verdict in Verdict},
         "stages_run": sum(len(outcome.ran) for outcome in outcomes),
         "stages_cached": sum(len(outcome.cached) for outcome in outcomes),
         "stage_seconds": round(sum(outcome.work_s for outcome in outcomes), 3),
@@ -130,7 +130,7 @@ def _copy(job: Job, first: str, entries: Mapping[str, Mapping[str, Any]], root: 
         "vehicle_id": job.vehicle_id,
         "session_id": job.session_id,
         "verdict": verdict,
-        "reason_code": "copy",
+        "reason_code": ReasonCode.COPY,
         "reason": f"It has the same content as {first}, under which its results are.",
         "copy_of": first,
         "findings": [],

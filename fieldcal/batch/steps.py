@@ -24,6 +24,8 @@ from fieldcal.flight.job import Job, file_stamp
 from fieldcal.flight.versions import versions
 from fieldcal.logs import ingest
 from fieldcal.logs.tidy import Disordered
+from fieldcal.names import Status, Verdict
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.pipeline import INGEST, PIPELINE, Stage, run_stage
 from fieldcal.stages.results import StageResult, plain
 from fieldcal.stages.run_key import run_key
@@ -68,7 +70,7 @@ class FlightWork:
 
     def usable(self) -> bool:
         """Whether ingest left anything to calibrate on; known once its record is."""
-        return self.records[INGEST]["facts"]["verdict"] in ("ok", "partial")
+        return Verdict(self.records[INGEST]["facts"]["verdict"]).usable
 
     def steps(self) -> tuple[str, ...]:
         """The steps there are: ingest alone for a log that is rejected or quarantined."""
@@ -162,7 +164,7 @@ class FlightWork:
     def _ingest(self) -> Record:
         key = self.key(INGEST)
         if self.job.problem is not None:
-            return self._ingest_record(ingest.rejected("not_readable", self.job.problem), {}, key, keep=False)
+            return self._ingest_record(ingest.rejected(ReasonCode.NOT_READABLE, self.job.problem), {}, key, keep=False)
         try:
             facts, signals = self._write_signals(whole=False)
         except Disordered:
@@ -171,11 +173,11 @@ class FlightWork:
             raise
         except Exception as error:
             return self._ingest_record(
-                ingest.rejected("ingest_failed", unforeseen(self.job.log_uri, error)), {}, key, keep=False
+                ingest.rejected(ReasonCode.INGEST_FAILED, unforeseen(self.job.log_uri, error)), {}, key, keep=False
             )
-        if facts["verdict"] != "rejected" and file_stamp(Path(self.job.path)) != tuple(self.job.stamp):
+        if facts["verdict"] != Verdict.REJECTED and file_stamp(Path(self.job.path)) != tuple(self.job.stamp):
             why = f"{self.job.log_uri} changed while it was read; the next night takes it when it is complete."
-            return self._ingest_record(ingest.rejected("changed_while_read", why), {}, key, keep=False)
+            return self._ingest_record(ingest.rejected(ReasonCode.CHANGED_WHILE_READ, why), {}, key, keep=False)
         return self._ingest_record(facts, signals, key, keep=facts["reason_code"] != ingest.TOO_SLOW)
 
     def _write_signals(self, *, whole: bool) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -191,7 +193,7 @@ class FlightWork:
                         writers[table] = stack.enter_context(self._writer(table, units))
                     writers[table].write(frame)
                 facts = log.facts()
-                if facts["verdict"] == "quarantined":
+                if facts["verdict"] == Verdict.QUARANTINED:
                     raise _Quarantined(facts)
         except _Quarantined as stop:
             return stop.facts, {}
@@ -203,9 +205,9 @@ class FlightWork:
         return signal_writer(self._root, table, self.job.vehicle_id, self.job.flight_id, units=units)
 
     def _ingest_record(self, facts: Mapping[str, Any], signals: Mapping[str, Any], key: str, *, keep: bool) -> Record:
-        status = "ok" if facts["verdict"] in ("ok", "partial") else "refused"
+        status = Status.OK if Verdict(facts["verdict"]).usable else Status.REFUSED
         record = {
-            "status": "failed" if facts["reason_code"] == "ingest_failed" else status,
+            "status": Status.FAILED if facts["reason_code"] == ReasonCode.INGEST_FAILED else status,
             "reason_code": facts["reason_code"],
             "reason": facts["reason"],
             "measured": plain({"rows": facts["rows"], "units": facts["units"], "verdict": facts["verdict"]}),
@@ -230,7 +232,7 @@ class FlightWork:
             raise
         except Exception as error:
             why = f"{stage.name}: {unforeseen(self.job.log_uri, error)}"
-            result = StageResult(status="failed", reason_code="stage_failed", reason=why)
+            result = StageResult(status=Status.FAILED, reason_code=ReasonCode.STAGE_FAILED, reason=why)
         record = {
             "status": result.status,
             "reason_code": result.reason_code,
@@ -238,7 +240,7 @@ class FlightWork:
             "measured": plain(result.measured),
             **self._causes(stage.name),
         }
-        if result.status == "failed":
+        if result.status == Status.FAILED:
             return _unkept(record, key)
         self._tables |= {f"{stage.name}.{name}": frame for name, frame in result.tables.items()}
         return self._kept(stage.name, key, result.tables, record)

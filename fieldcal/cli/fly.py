@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from fieldcal.cli.options import AsJson, Config, Output, Root, UnusedConfig
+from fieldcal.reason_codes import ReasonCode
 
 Format = Literal["px4", "ardupilot", "ros", "kalibr", "json", "c"]
 
@@ -105,4 +106,6 @@ def _keep(log: Path, output: Path) -> None:
 
     own, place = log.resolve(), output.resolve()
     if place == own or own in place.parents or (output.exists() and log.exists() and output.samefile(log)):
-        raise FieldcalError("wrong_option", f"{output} is the log itself, which is only ever read; name another place.")
+        raise FieldcalError(
+            ReasonCode.WRONG_OPTION, f"{output} is the log itself, which is only ever read; name another place."
+        )

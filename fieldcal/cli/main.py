@@ -19,9 +19,18 @@ from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Sc
 from fieldcal.cli.report import report as report_command
 from fieldcal.cli.serve import serve, trigger
 from fieldcal.cli.simulate import simulate
+from fieldcal.names import Verdict
+from fieldcal.reason_codes import ReasonCode
 
 OK, FAILED, USAGE, LOSSES, BUSY, INTERRUPTED = 0, 1, 2, 3, 75, 130
-USAGE_CODES = ("not_found", "no_archive", "no_session", "sql_refused", "sql_wrong", "wrong_option")
+USAGE_CODES = (
+    ReasonCode.NOT_FOUND,
+    ReasonCode.NO_ARCHIVE,
+    ReasonCode.NO_SESSION,
+    ReasonCode.SQL_REFUSED,
+    ReasonCode.SQL_WRONG,
+    ReasonCode.WRONG_OPTION,
+)
 
 app = App(
     name="fieldcal",
@@ -94,7 +103,7 @@ def calibrate(
         from fieldcal.cli.present_flight import print_flight
 
         print_flight(console(), document)
-    return OK if document["flight"]["verdict"] == "ok" else LOSSES
+    return OK if document["flight"]["verdict"] == Verdict.OK else LOSSES
 
 
 @app.command
@@ -117,7 +126,7 @@ def nightly(
     archive
         Folder of logs: ARCHIVE/<vehicle>/<session>/<log>.
     """
-    _need_folder(archive, "no_archive", "archive")
+    _need_folder(archive, ReasonCode.NO_ARCHIVE, "archive")
     where = {"runner": runner, "scheduler": scheduler}
     return _night(archive.absolute(), None, workers, where, dry_run, as_json, warehouse, config)
 
@@ -142,7 +151,7 @@ def session(
     folder
         Folder of the session: ARCHIVE/<vehicle>/<session>.
     """
-    _need_folder(folder, "no_session", "session folder")
+    _need_folder(folder, ReasonCode.NO_SESSION, "session folder")
     own = folder.absolute()
     where = {"runner": runner, "scheduler": scheduler}
     return _night(own.parent.parent, own, workers, where, dry_run, as_json, warehouse, config)
@@ -219,7 +228,7 @@ def verify(
     from fieldcal.words.talk import say
 
     if archive is not None:
-        _need_folder(archive, "no_archive", "archive")
+        _need_folder(archive, ReasonCode.NO_ARCHIVE, "archive")
     result = check(_root(warehouse), archive, log_sha256)
     if as_json:
         print_json(result)
@@ -292,7 +301,7 @@ def _explained(error: Exception) -> int:
     if isinstance(error, ConfigurationError):
         return _told(error.sentence, USAGE)
     if isinstance(error, FieldcalError):
-        code = BUSY if error.reason_code == "busy" else USAGE if error.reason_code in USAGE_CODES else FAILED
+        code = BUSY if error.reason_code == ReasonCode.BUSY else USAGE if error.reason_code in USAGE_CODES else FAILED
         return _told(error.sentence, code)
     if isinstance(error, OSError) and error.filename is not None:
         return _told(f"{error.filename}: {error.strerror}.", FAILED)
@@ -320,7 +329,7 @@ def _night(
     from fieldcal.flows.run import run_night
 
     if workers < 1:
-        raise _usage("wrong_option", "--workers must be 1 or more.")
+        raise _usage(ReasonCode.WRONG_OPTION, "--workers must be 1 or more.")
     root = _root(warehouse)
     if dry:
         plan = plan_only(archive, root, config, folder)
@@ -350,12 +359,12 @@ def _root(warehouse: Path | None) -> Path:
     return Warehouse(warehouse).root
 
 
-def _need_folder(folder: Path, reason_code: str, what: str) -> None:
+def _need_folder(folder: Path, reason_code: ReasonCode, what: str) -> None:
     if not folder.is_dir():
         raise _usage(reason_code, f"There is no {what} at {folder}.")
 
 
-def _usage(reason_code: str, sentence: str) -> Exception:
+def _usage(reason_code: ReasonCode, sentence: str) -> Exception:
     from fieldcal.errors import FieldcalError
 
     return FieldcalError(reason_code, sentence)
@@ -366,7 +375,7 @@ def _assignments(texts: list[str]) -> dict[str, str]:
     pairs = [text.partition("=") for text in texts]
     for name, equals, _ in pairs:
         if not equals or not name:
-            raise _usage("wrong_option", f'--set needs name=value, not "{name}".')
+            raise _usage(ReasonCode.WRONG_OPTION, f'--set needs name=value, not "{name}".')
     return {name.strip(): value.strip() for name, _, value in pairs}
 
 

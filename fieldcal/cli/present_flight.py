@@ -8,6 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from fieldcal.cli.show import table
+from fieldcal.names import Status
 from fieldcal.words.flights import QUANTITIES, Rows, advised, is_consequence, sync_sentence, verdict_sentence
 from fieldcal.words.numbers import cell, number, with_sd
 
@@ -46,7 +47,7 @@ def parameter_table(rows: Rows) -> Any:
                 continue
             name = (sensor, method) if shown != (sensor, method) else ("", "")
             shown = (sensor, method)
-            status = first["status"] if first["status"] == "ok" else f"{first['status']}: {first['reason_code']}"
+            status = first["status"] if first["status"] == Status.OK else f"{first['status']}: {first['reason_code']}"
             lines.append([*name, axis, *(_value(row) for row in own), status])
     return table(["sensor", "method", "axis", *PARAMETERS, "status"], lines)
 
@@ -57,7 +58,7 @@ def _value(row: Mapping[str, Any] | None) -> str:
 
 def print_refusals(console: Console, runs: Rows) -> None:
     """Stages that refused or failed: their sentence, and the numbers behind it. What follows from them is one line."""
-    stopped = [run for run in runs if run["status"] in ("refused", "failed") and run["stage"] != "ingest"]
+    stopped = [run for run in runs if run["status"] in (Status.REFUSED, Status.FAILED) and run["stage"] != "ingest"]
     follow = [run["stage"] for run in stopped if is_consequence(run)]
     told: set[str] = set()
     for run in stopped:

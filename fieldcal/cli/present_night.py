@@ -10,6 +10,7 @@ from rich.console import Console
 
 from fieldcal.batch.outcome import cause
 from fieldcal.cli.show import table
+from fieldcal.names import Verdict
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.flights import is_consequence
 from fieldcal.words.numbers import number
@@ -21,10 +22,10 @@ CHANGES = 20
 
 def print_night(console: Console, result: Mapping[str, Any], root: Path) -> None:
     """The closing table: verdicts, what was refused and why, the worst fits, where to look next."""
-    counts = ", ".join(f"{result[verdict]} {verdict}" for verdict in ("ok", "partial", "quarantined", "rejected"))
+    counts = ", ".join(f"{result[verdict]} {verdict}" for verdict in Verdict)
     work = f"{result['stages_run']} stages run, {result['stages_cached']} from the cache, {result['seconds']:.1f} s"
     console.print(f"{len(result['logs'])} logs: {counts}; {work}", markup=False)
-    troubled = [log for log in result["logs"] if log["verdict"] != "ok" or log["reason_code"]]
+    troubled = [log for log in result["logs"] if log["verdict"] != Verdict.OK or log["reason_code"]]
     if troubled:
         lines = [[log["log_uri"], log["verdict"], log["reason"] or ""] for log in troubled]
         console.print(table(["log", "verdict", "why"], lines, "Logs that need a look"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fieldcal.cli.options import AsJson, Output, Root, UnusedConfig
+from fieldcal.reason_codes import ReasonCode
 
 
 def report(
@@ -35,7 +36,7 @@ def report(
     from fieldcal.warehouse.questions import moment_of
 
     if vehicle is not None and flight is not None:
-        raise FieldcalError("wrong_option", "Give --vehicle or --flight, not both: a report is of one thing.")
+        raise FieldcalError(ReasonCode.WRONG_OPTION, "Give --vehicle or --flight, not both: a report is of one thing.")
     root = Warehouse(warehouse).root
     moment = None if as_of is None else moment_of("--as-of", as_of)
     if flight is not None:

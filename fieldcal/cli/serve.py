@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from fieldcal.cli.options import AsJson, Config, Root, SessionFolder
+from fieldcal.reason_codes import ReasonCode
 
 EVERY_NIGHT = "0 3 * * *"
 
@@ -49,7 +50,7 @@ def serve(
     place = archive or watch or (config.parent if config else Path())
     for what, folder in (("archive", place), ("archive to watch", watch)):
         if folder is not None and not folder.is_dir():
-            raise FieldcalError("no_archive", f"There is no {what} at {folder}.")
+            raise FieldcalError(ReasonCode.NO_ARCHIVE, f"There is no {what} at {folder}.")
     find_source(config, place)
     root = Warehouse(warehouse).root.absolute()
     prepare(root)
@@ -63,7 +64,7 @@ def serve(
         try:
             hosted = deployments(place, root, config, cron, workers, timezone)
         except ValueError as error:
-            raise FieldcalError("wrong_option", f'--cron "{cron}", --timezone: {_last_line(error)}') from error
+            raise FieldcalError(ReasonCode.WRONG_OPTION, f'--cron "{cron}", --timezone: {_last_line(error)}') from error
         when = f'"{cron}" ({timezone or local_timezone()})'
         say(f"Serving at {url}: nightly over {place.absolute()} at {when}, into {root}")
         say("Sessions: fieldcal trigger SESSION_DIR" + (f", and by themselves in {watch}" if watch else ""))
@@ -94,7 +95,7 @@ def trigger(
     from fieldcal.warehouse import Warehouse
 
     if not folder.is_dir():
-        raise FieldcalError("no_session", f"There is no session folder at {folder}.")
+        raise FieldcalError(ReasonCode.NO_SESSION, f"There is no session folder at {folder}.")
     root = Warehouse(warehouse).root
     url = server_address(root)
     prepare_environment(root, serving=True)

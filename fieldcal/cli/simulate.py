@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from fieldcal.cli.options import AsJson, UnusedConfig, UnusedRoot
+from fieldcal.reason_codes import ReasonCode
 
 OFF = Parameter(negative="")
 
@@ -171,4 +172,4 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
 def _wrong(sentence: str) -> Any:
     from fieldcal.errors import FieldcalError
 
-    return FieldcalError("wrong_option", sentence)
+    return FieldcalError(ReasonCode.WRONG_OPTION, sentence)

@@ -37,6 +37,7 @@ from fieldcal.config.values import (
 )
 from fieldcal.errors import ConfigurationError
 from fieldcal.names import SENSORS, Approach, Body, FieldUnit, GravitySign, ProfileName, World
+from fieldcal.reason_codes import ReasonCode
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 FIELD_UNITS = ("norm", "T", "uT", "G")
@@ -63,17 +64,18 @@ class LocalField(Table):
         if "north_east_down" in raw:
             if others := sorted(raw.keys() - {"north_east_down", "unit"}):
                 told = f"give either north_east_down or a place, not both (north_east_down and {others[0]})"
-                wrong("wrong_value", told)
+                wrong(ReasonCode.WRONG_VALUE, told)
             if "unit" not in raw:
-                wrong("wrong_value", f"north_east_down needs its unit, one of {', '.join(FIELD_UNITS)}")
+                wrong(ReasonCode.WRONG_VALUE, f"north_east_down needs its unit, one of {', '.join(FIELD_UNITS)}")
             vector = raw["north_east_down"]
             if isinstance(vector, list | tuple) and len(vector) == 3 and not any(vector):
-                wrong("wrong_value", "the field cannot be zero", "north_east_down")
+                wrong(ReasonCode.WRONG_VALUE, "the field cannot be zero", "north_east_down")
             return
         for key in ("latitude_deg", "longitude_deg"):
             if key not in raw:
                 wrong(
-                    "wrong_value", f"{key} is missing; give north_east_down and unit, or latitude_deg and longitude_deg"
+                    ReasonCode.WRONG_VALUE,
+                    f"{key} is missing; give north_east_down and unit, or latitude_deg and longitude_deg",
                 )
 
 
@@ -142,7 +144,7 @@ class Vehicle(VehicleTable):
 
 def _inside(glob: str) -> str:
     if Path(glob).is_absolute() or ".." in Path(glob).parts:
-        wrong("wrong_value", f"{shown(glob)} leaves the archive; give a glob relative to it")
+        wrong(ReasonCode.WRONG_VALUE, f"{shown(glob)} leaves the archive; give a glob relative to it")
     return glob
 
 
@@ -160,7 +162,7 @@ class LogsMap(Table):
     def check_whole(cls, raw: Mapping[str, object]) -> None:
         """The glob is needed."""
         if "glob" not in raw:
-            wrong("wrong_value", "glob is missing: the files this entry stands for")
+            wrong(ReasonCode.WRONG_VALUE, "glob is missing: the files this entry stands for")
 
 
 class Archive(Table):
@@ -235,9 +237,13 @@ def load(path: Path | None) -> Configuration:
     try:
         return parse(path.read_bytes().decode("utf-8-sig"), path)
     except OSError as error:
-        raise ConfigurationError("config_not_readable", f"{path}: cannot be read ({error.strerror}).") from error
+        raise ConfigurationError(
+            ReasonCode.CONFIG_NOT_READABLE, f"{path}: cannot be read ({error.strerror})."
+        ) from error
     except UnicodeDecodeError as error:
-        raise ConfigurationError("config_syntax", f"{path}: is not UTF-8 text (byte {error.start}).") from error
+        raise ConfigurationError(
+            ReasonCode.CONFIG_SYNTAX, f"{path}: is not UTF-8 text (byte {error.start})."
+        ) from error
 
 
 def parse(text: str, path: Path | None) -> Configuration:
@@ -246,7 +252,7 @@ def parse(text: str, path: Path | None) -> Configuration:
     try:
         return Configuration(path, Document.model_validate(tomllib.loads(text)))
     except tomllib.TOMLDecodeError as error:
-        raise ConfigurationError("config_syntax", f"{file}: is not TOML: {error}.") from error
+        raise ConfigurationError(ReasonCode.CONFIG_SYNTAX, f"{file}: is not TOML: {error}.") from error
     except ValidationError as error:
         raise configuration_error(file, Document, error) from error
 

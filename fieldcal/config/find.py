@@ -8,6 +8,7 @@ from pathlib import Path
 
 from fieldcal.config.configuration import Configuration, Vehicle, load, parse
 from fieldcal.errors import ConfigurationError
+from fieldcal.reason_codes import ReasonCode
 
 CONFIG_NAME = "fieldcal.toml"
 Source = dict[str, str | None]
@@ -28,7 +29,7 @@ def find_source(config: Path | None, archive: Path | None) -> Source:
     if path is None:
         return {"path": None, "text": ""}
     if not path.is_file():
-        raise ConfigurationError("config_not_readable", f"{path}: there is no such file.")
+        raise ConfigurationError(ReasonCode.CONFIG_NOT_READABLE, f"{path}: there is no such file.")
     load(path)
     return {"path": str(path), "text": path.read_bytes().decode("utf-8-sig")}
 

@@ -13,6 +13,7 @@ from pydantic_core import ErrorDetails
 
 from fieldcal.config.values import shown
 from fieldcal.errors import ConfigurationError
+from fieldcal.reason_codes import ReasonCode
 
 NEEDED = {
     "string_type": "a text",
@@ -44,7 +45,7 @@ def configuration_error(file: str, model: type[BaseModel], error: ValidationErro
     return ConfigurationError(reason_code, sentence, {"mistakes": [mistake for _, mistake in told]})
 
 
-def _mistake(file: str, model: type[BaseModel], error: ErrorDetails) -> tuple[str, str]:
+def _mistake(file: str, model: type[BaseModel], error: ErrorDetails) -> tuple[ReasonCode, str]:
     """Reason code and sentence of one mistake."""
     loc, context = list(error["loc"]), error.get("ctx", {})
     while loc and isinstance(loc[-1], int) and not _tables(model, loc[:-1]):
@@ -63,20 +64,20 @@ def _tables(model: type[BaseModel], loc: list[int | str]) -> bool:
 
 def _told(
     kind: str, value: object, context: Mapping[str, object], model: type[BaseModel], loc: tuple[int | str, ...]
-) -> tuple[str, str]:
+) -> tuple[ReasonCode, str]:
     if kind in ("unknown_key", "wrong_type", "wrong_value"):
-        return kind, str(context["problem"])
+        return ReasonCode(kind), str(context["problem"])
     if kind in NEEDED:
         # A whole number that no float holds is a number.
         too_large = kind == "float_type" and isinstance(value, int) and not isinstance(value, bool)
         if not too_large:
-            return "wrong_type", f"{NEEDED[kind]} is needed here, not {shown(value)}"
+            return ReasonCode.WRONG_TYPE, f"{NEEDED[kind]} is needed here, not {shown(value)}"
     if kind == "literal_error":
         allowed = re.findall("'([^']*)'", str(context["expected"]))
-        return "wrong_value", f"{shown(value)} is not one of {', '.join(allowed)}"
+        return ReasonCode.WRONG_VALUE, f"{shown(value)} is not one of {', '.join(allowed)}"
     if kind == "string_too_long":
-        return "wrong_value", f"a single character is needed here, not {shown(value)}"
-    return "wrong_value", f"{shown(value)} is not allowed; it must be {_limits(kind, model, loc)}"
+        return ReasonCode.WRONG_VALUE, f"a single character is needed here, not {shown(value)}"
+    return ReasonCode.WRONG_VALUE, f"{shown(value)} is not allowed; it must be {_limits(kind, model, loc)}"
 
 
 def _limits(kind: str, model: type[BaseModel], loc: tuple[int | str, ...]) -> str:

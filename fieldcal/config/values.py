@@ -15,14 +15,15 @@ from pydantic_core import PydanticCustomError
 
 from fieldcal import names
 from fieldcal.names import SENSORS, Approach, Sensor
+from fieldcal.reason_codes import ReasonCode
 
 T = TypeVar("T")
 Paths = str | tuple[str, ...]
 
 
-def wrong(reason_code: str, problem: str, *at: str) -> NoReturn:
+def wrong(reason_code: ReasonCode, problem: str, *at: str) -> NoReturn:
     """Refuse a value, or what stands in it under the keys `at`."""
-    raise PydanticCustomError(reason_code, "{problem}", {"problem": problem, "at": at})
+    raise PydanticCustomError(reason_code.value, "{problem}", {"problem": problem, "at": at})
 
 
 def shown(value: object) -> str:
@@ -38,14 +39,14 @@ def shown(value: object) -> str:
 def require_keys(value: object, known: Iterable[str]) -> Mapping[str, object]:
     """A table, all of whose keys are known."""
     if not isinstance(value, Mapping):
-        wrong("wrong_type", f"a table is needed here, not {shown(value)}")
+        wrong(ReasonCode.WRONG_TYPE, f"a table is needed here, not {shown(value)}")
     allowed = [str(key) for key in known]
     for key in value:
         if key not in allowed:
             nearest = difflib.get_close_matches(key.lower(), allowed, n=1, cutoff=0.0)
             close = difflib.get_close_matches(key.lower(), allowed, n=1, cutoff=0.6)
             hint = f'did you mean "{nearest[0]}"?' + ("" if close else f" Known here: {', '.join(allowed)}")
-            wrong("unknown_key", f'there is no key "{key}"; {hint}')
+            wrong(ReasonCode.UNKNOWN_KEY, f'there is no key "{key}"; {hint}')
     return value
 
 
@@ -72,7 +73,7 @@ def _listed(count: int, kind: str) -> BeforeValidator:
 
 def _items(value: object, count: int, kind: str) -> tuple[object, ...]:
     if not isinstance(value, list | tuple) or len(value) != count:
-        wrong("wrong_type", f"a list of {count} {kind} is needed here, not {shown(value)}")
+        wrong(ReasonCode.WRONG_TYPE, f"a list of {count} {kind} is needed here, not {shown(value)}")
     return tuple(value)
 
 
@@ -83,7 +84,7 @@ def _one_or_three(value: object) -> tuple[object, ...]:
 def _signs(value: object) -> tuple[object, ...]:
     items = _items(value, 3, "signs")
     if any(isinstance(item, bool) or item not in (1, -1) for item in items):
-        wrong("wrong_value", f"{shown(value)} is not allowed; each of the three must be 1 or -1")
+        wrong(ReasonCode.WRONG_VALUE, f"{shown(value)} is not allowed; each of the three must be 1 or -1")
     return tuple(1 if item == 1 else -1 for item in items)
 
 
@@ -91,19 +92,19 @@ def _orthonormal(rows: names.Rotation, tolerance: float = 1e-6) -> names.Rotatio
     """Refuse what is no rotation: rows orthonormal within `tolerance`, determinant +1."""
     off = max(abs(sum(p * q for p, q in zip(u, v, strict=True)) - (u is v)) for u in rows for v in rows)
     if off > tolerance:
-        wrong("wrong_value", f"the rows are not orthogonal unit vectors (off by {off:.3g}): not a rotation")
+        wrong(ReasonCode.WRONG_VALUE, f"the rows are not orthogonal unit vectors (off by {off:.3g}): not a rotation")
     a, b, c = rows
     determinant = (
         a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
     )
     if determinant < 0:
-        wrong("wrong_value", "the determinant is -1: a reflection, not a rotation; swap or negate one axis")
+        wrong(ReasonCode.WRONG_VALUE, "the determinant is -1: a reflection, not a rotation; swap or negate one axis")
     return rows
 
 
 def _text(value: object, *at: str) -> str:
     if not isinstance(value, str) or not value:
-        wrong("wrong_type", f"a text is needed here, not {shown(value)}", *at)
+        wrong(ReasonCode.WRONG_TYPE, f"a text is needed here, not {shown(value)}", *at)
     return value
 
 
@@ -117,10 +118,10 @@ def _columns(counts: Mapping[str, int], *, one_for_all: bool = False) -> Callabl
                 found[key] = _text(item, key)
                 continue
             if not isinstance(item, list | tuple) or len(item) != counts[key]:
-                wrong("wrong_type", f"a list of {counts[key]} texts is needed here, not {shown(item)}", key)
+                wrong(ReasonCode.WRONG_TYPE, f"a list of {counts[key]} texts is needed here, not {shown(item)}", key)
             texts = tuple(_text(text, key) for text in item)
             if len(set(texts)) != len(texts):
-                wrong("wrong_value", f"{shown(item)} names one thing twice", key)
+                wrong(ReasonCode.WRONG_VALUE, f"{shown(item)} names one thing twice", key)
             found[key] = texts
         return found
 
@@ -146,7 +147,7 @@ def require_choice(value: object, allowed: Iterable[str], *at: str) -> str:
     """One of the allowed texts."""
     listed = list(allowed)
     if not isinstance(value, str) or value not in listed:
-        wrong("wrong_value", f"{shown(value)} is not one of {', '.join(listed)}", *at)
+        wrong(ReasonCode.WRONG_VALUE, f"{shown(value)} is not one of {', '.join(listed)}", *at)
     return value
 
 

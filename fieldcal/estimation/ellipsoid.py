@@ -23,6 +23,7 @@ from fieldcal.estimation.statistics import (
     white_noise_sigma,
 )
 from fieldcal.geometry.rotation import Array
+from fieldcal.reason_codes import ReasonCode
 
 # Li and Griffiths' constraint 4J − I² > 0 on (θ1, θ2, θ3), and its inverse.
 C1 = np.array([[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0]])
@@ -128,7 +129,9 @@ def fit_ellipsoid(
     centre = z.mean(axis=0)
     spread = float(np.sqrt(np.mean((z - centre) ** 2))) * (_noise_shape(z) if method == "robust" else np.ones(3))
     if not (spread > 0.0).all():
-        raise UnusableFlight("ellipsoid_degenerate", "All readings are the same: the sensor is stuck or was not moved.")
+        raise UnusableFlight(
+            ReasonCode.ELLIPSOID_DEGENERATE, "All readings are the same: the sensor is stuck or was not moved."
+        )
     x = (z - centre) / spread
     scale, bias, weight, iterations = METHODS[method](x)
     fit = _with_statistics(x, scale, bias, weight, iterations)
@@ -160,14 +163,16 @@ def _quadric_to_triad(theta: Array, offset: float) -> tuple[Array, Array]:
     lengths, axes = np.linalg.eigh(q)
     if lengths[0] <= 1e-12 * lengths[2]:
         raise UnusableFlight(
-            "ellipsoid_degenerate",
+            ReasonCode.ELLIPSOID_DEGENERATE,
             "The readings lie on a plane or an open surface, not an ellipsoid: turn through more attitudes.",
             {"quadric_eigenvalues": [float(v) for v in lengths]},
         )
     to_centre = np.linalg.solve(q, p)
     g = float(p @ to_centre - offset)  # G of Eq. 7–8
     if g <= 0:
-        raise UnusableFlight("ellipsoid_degenerate", "The fitted quadric has no real points: too little motion.")
+        raise UnusableFlight(
+            ReasonCode.ELLIPSOID_DEGENERATE, "The fitted quadric has no real points: too little motion."
+        )
     scale = (axes * np.sqrt(lengths / g)) @ axes.T  # λ_i = f √(θ_i/G); f = 1
     return scale, scale @ to_centre  # b_i = λ_i θ_{i+6}/θ_i
 
@@ -188,7 +193,9 @@ def _li_griffiths(x: Array, *, full: bool = False) -> Solution:
     try:
         lower = np.linalg.solve(s22, s12.T)
     except np.linalg.LinAlgError as error:
-        raise UnusableFlight("ellipsoid_degenerate", "The readings lie in a plane: turn about more axes.") from error
+        raise UnusableFlight(
+            ReasonCode.ELLIPSOID_DEGENERATE, "The readings lie in a plane: turn about more axes."
+        ) from error
     values, vectors = np.linalg.eig(inverse @ (s11 - s12 @ lower))
     v1 = vectors[:, int(np.argmax(values.real))].real  # the largest, not "the positive one"
     v2 = -lower @ v1
@@ -238,7 +245,7 @@ def _sphere(x: Array) -> Solution:
     t, _, rank, _ = np.linalg.lstsq(d, np.sum(x * x, axis=1), rcond=None)
     radius_squared = float(t[3] + t[:3] @ t[:3])
     if rank < 4 or radius_squared <= 0:
-        raise UnusableFlight("ellipsoid_degenerate", "The readings lie in a plane: turn about more axes.")
+        raise UnusableFlight(ReasonCode.ELLIPSOID_DEGENERATE, "The readings lie in a plane: turn about more axes.")
     radius = np.sqrt(radius_squared)
     return np.eye(3) / radius, -t[:3] / radius, np.ones(len(x)), 1
 
@@ -324,7 +331,7 @@ def _gauss_newton(rows: Array, scale: Array, bias: Array, *, robust: bool, max_i
         if size < max(1e-9, 1e-3 * sigma / np.sqrt(x.shape[1])):
             return np.diag(diagonal), bias, weight, iteration
     raise EstimationError(
-        "ellipsoid_diverged",
+        ReasonCode.ELLIPSOID_DIVERGED,
         "The ellipsoid refinement found no minimum: too little of the sphere was seen, or other accelerations or fields"
         " drown the curvature.",
         {"iterations": iteration, "residual_rms_relative": float(np.sqrt(np.mean((at.residual * at.divisor) ** 2)))},
@@ -417,7 +424,7 @@ def require_determined(
     relative = max(measured["scale_relative_sd"])
     if not fit.condition <= max_condition:
         raise UnusableFlight(
-            "too_little_motion",
+            ReasonCode.TOO_LITTLE_MOTION,
             f"Too little of the sphere was seen: condition number {fit.condition:.3g}, at most {max_condition:.3g} is"
             " accepted. Tilt the vehicle further about every axis.",
             measured,
@@ -427,20 +434,20 @@ def require_determined(
         measured["scale_over_nominal"] = [float(v) for v in ratio]
         if (ratio < 0.5).any() or (ratio > 2.0).any():
             raise UnusableFlight(
-                "scale_not_nominal",
+                ReasonCode.SCALE_NOT_NOMINAL,
                 f"A scale is {ratio.min():.3g} to {ratio.max():.3g} times its nominal value, outside 0.5 to 2: wrong"
                 " unit, wrong field strength, or a collapsed fit.",
                 measured,
             )
     if not relative <= max_scale_sd:
         raise UnusableFlight(
-            "scale_uncertain",
+            ReasonCode.SCALE_UNCERTAIN,
             f"A scale is uncertain by {100 * relative:.3g} % (one sd); at most {100 * max_scale_sd:.3g} % is accepted.",
             measured,
         )
     if not fit.residual_rms <= max_residual:
         raise UnusableFlight(
-            "not_a_sphere",
+            ReasonCode.NOT_A_SPHERE,
             f"The calibrated length varies by {100 * fit.residual_rms:.3g} % rms, above {100 * max_residual:.3g} %:"
             " another field or other accelerations were sensed.",
             measured,

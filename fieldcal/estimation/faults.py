@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fieldcal.estimation.segments import run_starts
 from fieldcal.geometry.rotation import Array
+from fieldcal.reason_codes import ReasonCode
 
 AXES = "xyz"
 TEN_SAMPLES = 10
@@ -65,7 +66,7 @@ class Fault:
 
     sensor: str
     axis: str
-    code: str
+    code: ReasonCode
     value: float
     limit: float
     fatal: bool
@@ -109,7 +110,7 @@ def channel_faults(sensor: str, t: ArrayLike, logged: ArrayLike, unit: str, si_s
 def _dead(sensor: str, axis: str, x: Array, unit: str) -> Fault | None:
     if np.ptp(x) > 0:
         return None
-    code = "all_zero" if x[0] == 0 else "stuck"
+    code = ReasonCode.ALL_ZERO if x[0] == 0 else ReasonCode.STUCK
     sentence = f"The {sensor}'s {axis} reads {x[0]:.6g} {unit} in all {len(x)} samples: it is dead or not connected."
     return Fault(sensor, axis, code, 1.0, STUCK_SHARE, True, sentence)
 
@@ -129,7 +130,7 @@ def _stuck(sensor: str, axis: str, t: Array, x: Array, unit: str) -> Fault | Non
         f"The {sensor}'s {axis} stands at {x[start[longest]]:.6g} {unit} for {held[longest]:.1f} s"
         f" ({100 * share:.1f} % of the recording in all) where it else changes within {usual:.3g} s: it was stuck."
     )
-    return Fault(sensor, axis, "stuck", share, STUCK_SHARE, share > STUCK_SHARE, sentence)
+    return Fault(sensor, axis, ReasonCode.STUCK, share, STUCK_SHARE, share > STUCK_SHARE, sentence)
 
 
 def _clipped(sensor: str, axis: str, x: Array, unit: str) -> Fault | None:
@@ -145,7 +146,7 @@ def _clipped(sensor: str, axis: str, x: Array, unit: str) -> Fault | None:
     share = at / len(x)
     where = " and ".join(f"{level:.6g} {unit}" for level, _ in rails)
     sentence = f"The {sensor}'s {axis} is clipped at {where}: {at} of {len(x)} samples ({100 * share:.2f} %)."
-    return Fault(sensor, axis, "saturated", share, CLIPPED_SHARE, share > CLIPPED_SHARE, sentence)
+    return Fault(sensor, axis, ReasonCode.SATURATED, share, CLIPPED_SHARE, share > CLIPPED_SHARE, sentence)
 
 
 def _random(sensor: str, axis: str, x: Array, loud: float) -> Fault | None:
@@ -158,7 +159,7 @@ def _random(sensor: str, axis: str, x: Array, loud: float) -> Fault | None:
         f"The {sensor}'s {axis} is noise: its readings scatter by {spread:.3g} (SI) and successive ones are unrelated"
         f" (ratio {ratio:.2f}; a moving body shows below {WHITE_RATIO})."
     )
-    return Fault(sensor, axis, "random", ratio, WHITE_RATIO, True, sentence)
+    return Fault(sensor, axis, ReasonCode.RANDOM, ratio, WHITE_RATIO, True, sentence)
 
 
 def accelerometer_unit(logged: ArrayLike, unit: str, in_mps2: float, gravity_mps2: float) -> Fault | None:
@@ -194,7 +195,7 @@ def gyroscope_unit(logged: ArrayLike, unit: str, in_radps: float) -> Fault | Non
         + ("deg/s" if np.degrees(1.0) * FASTEST_RADPS >= fastest else "counts")
         + ". Correct units.gyroscope."
     )
-    return Fault("gyroscope", "", "wrong_unit", fastest, FASTEST_RADPS, True, sentence)
+    return Fault("gyroscope", "", ReasonCode.WRONG_UNIT, fastest, FASTEST_RADPS, True, sentence)
 
 
 def _unit_fault(
@@ -214,7 +215,7 @@ def _unit_fault(
         f"The {sensor}'s readings are {ratio:.3g} times as long as {what} when their unit is {unit}{hint}. Correct"
         f" units.{sensor}."
     )
-    return Fault(sensor, "", "wrong_unit", ratio, allowed[ratio > 1], True, sentence)
+    return Fault(sensor, "", ReasonCode.WRONG_UNIT, ratio, allowed[ratio > 1], True, sentence)
 
 
 def sampling_faults(sensor: str, t: ArrayLike) -> list[Fault]:
@@ -231,11 +232,13 @@ def sampling_faults(sensor: str, t: ArrayLike) -> list[Fault]:
             f"The {sensor} lost about {missing:.0f} samples ({100 * share:.2f} %) in {int(lost.sum())} dropouts, the"
             f" longest {step[lost].max():.3f} s."
         )
-        faults.append(Fault(sensor, "", "dropouts", share, CLIPPED_SHARE, False, sentence))
+        faults.append(Fault(sensor, "", ReasonCode.DROPOUTS, share, CLIPPED_SHARE, False, sentence))
     rates = _windowed_rates(t)
     if len(rates) > 1 and rates.max() > RATE_CHANGE * rates.min():
         sentence = f"The {sensor}'s rate changes between {rates.min():.4g} and {rates.max():.4g} Hz."
-        faults.append(Fault(sensor, "", "rate_changes", float(rates.max() / rates.min()), RATE_CHANGE, False, sentence))
+        faults.append(
+            Fault(sensor, "", ReasonCode.RATE_CHANGES, float(rates.max() / rates.min()), RATE_CHANGE, False, sentence)
+        )
     return faults
 
 

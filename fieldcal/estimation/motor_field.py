@@ -16,6 +16,7 @@ from scipy.special import fdtrc
 from fieldcal.estimation.faults import Fault
 from fieldcal.estimation.statistics import independent_samples, least_squares_covariance
 from fieldcal.geometry.rotation import Array
+from fieldcal.reason_codes import ReasonCode
 
 TOLD = 0.02
 """Share of the local field, about 1° of heading, that the current's field may reach before it is told."""
@@ -163,4 +164,4 @@ def motor_fault(found: MotorField, drive: str, drive_unit: str, field_unit: str)
         + ("No constant calibration describes it. " if fatal else "")
         + "Move the magnetometer away from the power wires, or twist them."
     )
-    return Fault("magnetometer", "", "motor_field", found.share, FATAL if fatal else TOLD, fatal, sentence)
+    return Fault("magnetometer", "", ReasonCode.MOTOR_FIELD, found.share, FATAL if fatal else TOLD, fatal, sentence)

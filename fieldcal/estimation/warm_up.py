@@ -23,6 +23,7 @@ from fieldcal.estimation.statistics import (
     white_noise_sigma,
 )
 from fieldcal.geometry.rotation import Array
+from fieldcal.reason_codes import ReasonCode
 
 WINDOW_S = 2.0
 BLOCK_S = 0.1
@@ -114,7 +115,7 @@ def fit_warm_up(t: ArrayLike, logged: ArrayLike, temperature_degc: ArrayLike, *,
     middles, means = rest_windows(stamps, logged, max_gap_s=max_gap_s)
     if len(middles) < LEAST_WINDOWS:
         raise UnusableFlight(
-            "too_little_rest",
+            ReasonCode.TOO_LITTLE_REST,
             f"{len(middles)} windows of {WINDOW_S:g} s at rest; {LEAST_WINDOWS} are needed for a slope on temperature.",
             {"rest_windows": len(middles)},
         )
@@ -122,7 +123,7 @@ def fit_warm_up(t: ArrayLike, logged: ArrayLike, temperature_degc: ArrayLike, *,
     span = float(np.ptp(warm))
     if span < LEAST_SPAN_DEGC:
         raise UnusableFlight(
-            "temperature_steady",
+            ReasonCode.TEMPERATURE_STEADY,
             f"The temperature moved by {span:.1f} °C at rest; {LEAST_SPAN_DEGC:g} °C are needed for a slope.",
             {"rest_windows": len(middles), "span_degc": span},
         )
@@ -177,7 +178,7 @@ def fit_resting_accelerometer(
     warm = np.interp(middles, stamps, np.asarray(temperature_degc, dtype=float))
     span = float(np.ptp(warm)) if len(warm) else 0.0
     if len(middles) < LEAST_WINDOWS or span < LEAST_SPAN_DEGC:
-        code = "too_little_rest" if len(middles) < LEAST_WINDOWS else "temperature_steady"
+        code = ReasonCode.TOO_LITTLE_REST if len(middles) < LEAST_WINDOWS else ReasonCode.TEMPERATURE_STEADY
         raise UnusableFlight(
             code,
             f"The longest rest has {len(middles)} windows and {span:.1f} °C; {LEAST_WINDOWS} and {LEAST_SPAN_DEGC:g} °C"

@@ -20,7 +20,8 @@ from fieldcal.geometry.frames import FRD_FROM_FLU
 from fieldcal.geometry.rotation import Array
 from fieldcal.logs import ingest
 from fieldcal.logs.mcap.write import imu_channel, magnetic_field_channel, temperature_channel, write_mcap
-from fieldcal.names import INERTIAL_FIRST, Sensor
+from fieldcal.names import INERTIAL_FIRST, Sensor, Verdict
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.tables import columns_of, matrix, triad
 from fieldcal.warehouse.errors import disk
 from fieldcal.warehouse.store import TableWriter
@@ -54,15 +55,15 @@ def apply_constants(
     """
     log = log.absolute()
     if not log.exists():
-        raise FieldcalError("not_found", f"There is no log at {log}.")
+        raise FieldcalError(ReasonCode.NOT_FOUND, f"There is no log at {log}.")
     own = log.parent.parent.parent / CONFIG_NAME
     vehicle = configuration_of(find_source(config or (own if own.is_file() else None), None)).vehicle(
         vehicle_id or log.parent.parent.name
     )
     constants = constants_of(root, vehicle.vehicle_id, temperature_degc)
     signals, facts = ingest.read_flight(log, vehicle)
-    if facts["verdict"] not in ("ok", "partial"):
-        raise FieldcalError("not_usable", f"{log.name}: {facts['reason']}")
+    if not Verdict(facts["verdict"]).usable:
+        raise FieldcalError(ReasonCode.NOT_USABLE, f"{log.name}: {facts['reason']}")
     settings = ingest.settings_of(facts, vehicle)
     temperature = signals.get("temperature") if temperature_degc is None else None
     readings, warnings = {}, []
@@ -76,7 +77,7 @@ def apply_constants(
             continue
         if constant.logged_unit != settings.units[name]:
             raise FieldcalError(
-                "unit_mismatch",
+                ReasonCode.UNIT_MISMATCH,
                 f"{log.name}: the {name} is in {settings.units[name]}, the constants are for {constant.logged_unit};"
                 " give the vehicle whose log this is (--vehicle), or its units in fieldcal.toml.",
             )
@@ -84,7 +85,7 @@ def apply_constants(
         readings[name] = t_ns, constant.apply(matrix(table, triad(name)), _temperature_at(t_ns, temperature))
         warnings += _outside(name, constant, temperature)
     if not readings:
-        raise FieldcalError("no_calibration", f"{log.name}: no sensor of this log has constants.")
+        raise FieldcalError(ReasonCode.NO_CALIBRATION, f"{log.name}: no sensor of this log has constants.")
     return Calibrated(readings, signals.get("temperature"), settings, constants, tuple(warnings))
 
 

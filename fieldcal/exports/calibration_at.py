@@ -11,6 +11,7 @@ import polars as pl
 from fieldcal.errors import FieldcalError
 from fieldcal.exports.calibration import Constants, Triad, cubic_about
 from fieldcal.names import INERTIAL_FIRST
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.stages.tables import AXES
 from fieldcal.warehouse.questions import existing
@@ -39,13 +40,15 @@ def constants_of(root: Path, vehicle_id: str, temperature_degc: float | None = N
     if rows.is_empty():
         known = warehouse.scan("calibration").select("vehicle_id").unique().sort("vehicle_id").collect()["vehicle_id"]
         there = ", ".join(known.head(20).to_list()) or "none"
-        raise FieldcalError("no_calibration", f"No calibration of vehicle {vehicle_id!r} is known; there is: {there}.")
+        raise FieldcalError(
+            ReasonCode.NO_CALIBRATION, f"No calibration of vehicle {vehicle_id!r} is known; there is: {there}."
+        )
     last = rows.sort("started_at", "flight_id", nulls_last=False).row(-1, named=True)
     rows = rows.filter(pl.col("imu_id") == last["imu_id"])
     triads = {s: triad for s in INERTIAL_FIRST if (triad := _triad(rows.filter(sensor=s), at)) is not None}
     if not triads:
         raise FieldcalError(
-            "no_calibration",
+            ReasonCode.NO_CALIBRATION,
             f'No sensor of {vehicle_id!r} has all its axes calibrated; `fieldcal sql "FROM refusals"` says why.',
         )
     as_of = "" if last["started_at"] is None else last["started_at"].isoformat()

@@ -17,7 +17,8 @@ from fieldcal.flight.rows import flight_row, judged, lead, published_tables, row
 from fieldcal.flight.threads import one_thread
 from fieldcal.flight.versions import versions
 from fieldcal.logs import flight_id, ingest, log_format, log_sha256
-from fieldcal.names import SENSORS, Approach
+from fieldcal.names import SENSORS, Approach, Status, Verdict
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.pipeline import INGEST, PIPELINE, run_stage
 from fieldcal.stages.results import StageResult, plain
 from fieldcal.words.rows import rows_of, unfolded
@@ -73,7 +74,7 @@ def run_log(
     records: dict[str, dict[str, Any]] = {INGEST: _record(_ingest_result(facts))}
     settings: FlightSettings | None = None
     tables: dict[str, pl.DataFrame] = {f"{INGEST}.{name}": frame for name, frame in signals.items()}
-    if facts["verdict"] in ("ok", "partial"):
+    if Verdict(facts["verdict"]).usable:
         settings = ingest.settings_of(facts, vehicle)
         for stage in PIPELINE:
             try:
@@ -81,7 +82,7 @@ def run_log(
                     result = run_stage(stage, tables, settings)
             except Exception as error:
                 why = f"{stage.name}: {unforeseen(job.log_uri, error)}"
-                result = StageResult(status="failed", reason_code="stage_failed", reason=why)
+                result = StageResult(status=Status.FAILED, reason_code=ReasonCode.STAGE_FAILED, reason=why)
             records[stage.name] = _record(result)
             tables |= {f"{stage.name}.{name}": frame for name, frame in result.tables.items()}
     facts = judged(facts, records)
@@ -106,17 +107,17 @@ def _configuration(config: Path | None, archive: Path) -> Configuration:
 
 def _job(log: Path, vehicle_id: str, session_id: str, archive: Path) -> Job:
     if not log.exists():
-        raise FieldcalError("not_found", f"There is no log at {log}.")
+        raise FieldcalError(ReasonCode.NOT_FOUND, f"There is no log at {log}.")
     try:
         sha256 = log_sha256(log)
     except OSError as error:
-        raise FieldcalError("not_readable", f"{log} cannot be read ({error.strerror}).") from error
+        raise FieldcalError(ReasonCode.NOT_READABLE, f"{log} cannot be read ({error.strerror}).") from error
     kind = log_format(log) or log.suffix.lstrip(".") or "unknown"
     return Job(str(log), log.relative_to(archive).as_posix(), vehicle_id, session_id, kind, sha256, flight_id(sha256))
 
 
 def _ingest_result(facts: dict[str, Any]) -> StageResult:
-    status = "ok" if facts["verdict"] in ("ok", "partial") else "refused"
+    status = Status.OK if Verdict(facts["verdict"]).usable else Status.REFUSED
     measured = {"rows": facts["rows"], "units": facts["units"], "verdict": facts["verdict"]}
     return StageResult(status=status, reason_code=facts["reason_code"], reason=facts["reason"], measured=measured)
 

@@ -12,6 +12,7 @@ import polars as pl
 from fieldcal import schemas
 from fieldcal.flight.job import Job
 from fieldcal.logs import ingest
+from fieldcal.names import Status, Verdict
 from fieldcal.stages.pipeline import PUBLISHED
 from fieldcal.warehouse.store import empty_frame, frame
 
@@ -86,9 +87,14 @@ def judged(facts: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -
     faults = [fault for record in records.values() for fault in record["measured"].get("faults", [])]
     told = [{"code": fault["code"], "count": 1, "sentence": fault["sentence"]} for fault in faults]
     facts = {**facts, "findings": [*facts["findings"], *told]}
-    failed = [record for record in records.values() if record["status"] == "failed"]
-    if facts["verdict"] == "ok" and failed:
-        return {**facts, "verdict": "partial", "reason_code": failed[0]["reason_code"], "reason": failed[0]["reason"]}
+    failed = [record for record in records.values() if record["status"] == Status.FAILED]
+    if facts["verdict"] == Verdict.OK and failed:
+        return {
+            **facts,
+            "verdict": Verdict.PARTIAL,
+            "reason_code": failed[0]["reason_code"],
+            "reason": failed[0]["reason"],
+        }
     return facts
 
 
@@ -97,7 +103,7 @@ def refusals(records: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     return [
         {"stage": step, "status": record["status"], "reason_code": record["reason_code"], "reason": record["reason"]}
         for step, record in records.items()
-        if record["status"] in ("refused", "failed")
+        if record["status"] in (Status.REFUSED, Status.FAILED)
     ]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from fieldcal.errors import ConfigurationError
 from fieldcal.geometry.rotation import Array
+from fieldcal.reason_codes import ReasonCode
 
 UNIT_IN_TESLA = {"T": 1.0, "uT": 1e-6, "G": 1e-4}
 
@@ -37,13 +38,14 @@ def world_magnetic_model(latitude_deg: float, longitude_deg: float, altitude_m: 
     year = when.year + (when - start).total_seconds() / length
     if not (-90 <= latitude_deg <= 90 and -180 <= longitude_deg <= 360):
         raise ConfigurationError(
-            "field_outside_model", f"latitude {latitude_deg}, longitude {longitude_deg} is no position on the Earth."
+            ReasonCode.FIELD_OUTSIDE_MODEL,
+            f"latitude {latitude_deg}, longitude {longitude_deg} is no position on the Earth.",
         )
     try:
         result = _model(when.year).calculate(glat=latitude_deg, glon=longitude_deg, alt=altitude_m / 1000.0, time=year)
     except ValueError as error:
         raise ConfigurationError(
-            "field_outside_model",
+            ReasonCode.FIELD_OUTSIDE_MODEL,
             f"The World Magnetic Model does not cover {when.date()}: configure"
             f" field.north_east_down instead ({error}).",
         ) from error

@@ -27,6 +27,7 @@ from fieldcal.logs.interface import (
     LogSummary,
 )
 from fieldcal.logs.mcap.reader import McapLog
+from fieldcal.reason_codes import ReasonCode
 
 READERS: dict[str, Callable[[Path, Vehicle], LogReader]] = {"mcap": McapLog, "csv": CsvLog}
 """Log format (as `discovery.log_format` names it) -> reader."""
@@ -50,12 +51,12 @@ def open_log(path: Path, vehicle: Vehicle) -> LogReader:
         With a reason code and a sentence. Iterating `batches()` may raise it too.
     """
     if not path.exists():
-        raise UnreadableLog("not_found", f"{path.name} does not exist. Check the path.")
+        raise UnreadableLog(ReasonCode.NOT_FOUND, f"{path.name} does not exist. Check the path.")
     kind = log_format(path)
     if kind not in READERS:
         what = _NOT_YET.get(kind or "", f"a {path.suffix or 'folder without imu.csv'}")
         raise UnreadableLog(
-            "format_not_supported",
+            ReasonCode.FORMAT_NOT_SUPPORTED,
             f"{path.name} is {what}, which cannot be read. Convert it to MCAP or CSV.",
         )
     return READERS[kind](path, vehicle)

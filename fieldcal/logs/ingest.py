@@ -22,10 +22,12 @@ from fieldcal.logs import Finding, LogReader, LogSummary, open_log
 from fieldcal.logs.discovery import folder_parts
 from fieldcal.logs.interface import EPOCH_KNOWN_AFTER_NS
 from fieldcal.logs.tidy import HELD_ROWS, Disordered, TidySignal
+from fieldcal.names import Verdict
+from fieldcal.reason_codes import ReasonCode
 
 LEAST_SAMPLES = 10
 SECONDS_ALLOWED = 60.0
-TOO_SLOW = "too_slow"
+TOO_SLOW = ReasonCode.TOO_SLOW
 """The one refusal that another try may not meet again."""
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -83,14 +85,14 @@ class TidyLog:
                 yield table, self._seen(table, frame)
         if "imu" not in self._signals or not self._signals["imu"].rows:
             raise UnreadableLog(
-                "no_imu",
+                ReasonCode.NO_IMU,
                 f"{self._name}: not one usable IMU sample"
                 + "".join(f" ({finding.sentence})" for finding in self._findings()[:1])
                 + ". Check the topics or columns in fieldcal.toml.",
             )
         if self._signals["imu"].rows < LEAST_SAMPLES:
             raise UnreadableLog(
-                "too_few_samples",
+                ReasonCode.TOO_FEW_SAMPLES,
                 f"{self._name} holds {self._signals['imu'].rows} IMU samples at different times, {LEAST_SAMPLES} are "
                 "the least." + "".join(f" {finding.sentence}" for finding in self._findings()[:1]),
             )
@@ -168,15 +170,15 @@ def verdict(findings: list[Finding]) -> dict[str, Any]:
     """Findings as plain JSON, and the verdict they add up to with the gravest one's code and sentence."""
     listed = [{"code": f.code, "count": f.count, "sentence": f.sentence} for f in findings]
     for name, grave in (
-        ("quarantined", [f for f in findings if f.fatal]),
-        ("partial", [f for f in findings if f.loses_data]),
+        (Verdict.QUARANTINED, [f for f in findings if f.fatal]),
+        (Verdict.PARTIAL, [f for f in findings if f.loses_data]),
     ):
         if grave:
             return {"verdict": name, "reason_code": grave[0].code, "reason": grave[0].sentence, "findings": listed}
-    return {"verdict": "ok", "reason_code": None, "reason": None, "findings": listed}
+    return {"verdict": Verdict.OK, "reason_code": None, "reason": None, "findings": listed}
 
 
-def rejected(reason_code: str, reason: str) -> dict[str, Any]:
+def rejected(reason_code: ReasonCode, reason: str) -> dict[str, Any]:
     """Facts of a log in which nothing is usable."""
     unknown = ("duration_s", "imu_rate_hz", "vps_rate_hz", "n_samples", "started_at_ns", "position")
     temperatures = ("temperature_min_degc", "temperature_mean_degc", "temperature_max_degc")
@@ -184,7 +186,7 @@ def rejected(reason_code: str, reason: str) -> dict[str, Any]:
         **dict.fromkeys((*unknown, *temperatures)),
         **declared(LogSummary("")),
         "rows": {},
-        "verdict": "rejected",
+        "verdict": Verdict.REJECTED,
         "reason_code": reason_code,
         "reason": reason,
         "findings": [],

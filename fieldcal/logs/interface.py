@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from fieldcal.config.values import UNITS
 from fieldcal.names import SENSORS, Sensor
+from fieldcal.reason_codes import ReasonCode
 
 Columns = dict[str, NDArray[Any]]
 Batch = tuple[str, Columns]
@@ -47,7 +48,7 @@ class Finding:
     `fatal`: the log contradicts itself; nothing of it should be published.
     """
 
-    code: str
+    code: ReasonCode
     count: int
     sentence: str
     loses_data: bool = False
@@ -75,7 +76,9 @@ class LogSummary:
     counts: dict[str, int] = field(default_factory=dict)
     metadata: dict[str, str] = field(default_factory=dict)
 
-    def add(self, code: str, count: int, sentence: str, *, loses_data: bool = False, fatal: bool = False) -> None:
+    def add(
+        self, code: ReasonCode, count: int, sentence: str, *, loses_data: bool = False, fatal: bool = False
+    ) -> None:
         """Record one finding."""
         self.findings.append(Finding(code, count, sentence, loses_data, fatal))
 
@@ -123,7 +126,7 @@ def logged_units(
         if own and own not in UNITS[sensor]:
             if not wanted:
                 summary.add(
-                    "unit_not_supported",
+                    ReasonCode.UNIT_NOT_SUPPORTED,
                     1,
                     f"{log_name}: the log gives its {sensor} in {own!r}, which is none of "
                     f"{', '.join(UNITS[sensor])}. Convert the log.",
@@ -131,7 +134,7 @@ def logged_units(
             own = None
         if own and wanted and own != wanted:
             summary.add(
-                "unit_conflict",
+                ReasonCode.UNIT_CONFLICT,
                 1,
                 f"{log_name}: the log gives its {sensor} in {own}, the configuration says {wanted}; the configuration "
                 f"is followed. Correct units.{sensor} if the log is right.",

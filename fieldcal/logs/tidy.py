@@ -13,6 +13,7 @@ import polars as pl
 from fieldcal.errors import UnreadableLog
 from fieldcal.estimation.segments import begins_run
 from fieldcal.logs import SIGNAL_COLUMNS, Columns, Finding, batch_frame, stamps
+from fieldcal.reason_codes import ReasonCode
 
 SENSOR_TABLES = ("imu", "magnetometer", "vps")
 MAY_BE_UNKNOWN = ("px_m", "py_m", "pz_m", "altitude_m", "current_a", "throttle")
@@ -84,7 +85,7 @@ class TidySignal:
         self._n_held += len(frame)
         if self._n_held > WHOLE_ROWS_CAP:
             raise UnreadableLog(
-                "too_disordered",
+                ReasonCode.TOO_DISORDERED,
                 f"The stamps of {self.table} are so out of order that more than {WHOLE_ROWS_CAP} rows would have to be "
                 "held to sort them. Sort the log, or split it.",
             )
@@ -172,14 +173,14 @@ class TidySignal:
         yield from self._clock_findings(name)
         if self.not_finite:
             yield Finding(
-                "not_finite",
+                ReasonCode.NOT_FINITE,
                 self.not_finite,
                 f"{name}: {self.not_finite} rows of {table} hold NaN or infinity and were left out.",
                 loses_data=sensors,
             )
         if self.conflicts > MOST_REPEATED * (self.rows + self.conflicts):
             yield Finding(
-                "clock_stands",
+                ReasonCode.CLOCK_STANDS,
                 self.conflicts,
                 f"{name}: {self.conflicts} of {self.rows + self.conflicts} rows of {table} carry the same time as "
                 "another row with other values: the clock stands, or the times were rounded. Export the log again.",
@@ -187,7 +188,7 @@ class TidySignal:
             )
         elif self.conflicts:
             yield Finding(
-                "repeated_stamps",
+                ReasonCode.REPEATED_STAMPS,
                 self.conflicts,
                 f"{name}: {self.conflicts} rows of {table} repeat a time stamp with other values; the first of each "
                 "stamp was kept.",
@@ -195,7 +196,7 @@ class TidySignal:
             )
         if self.duplicates:
             yield Finding(
-                "duplicate_rows",
+                ReasonCode.DUPLICATE_ROWS,
                 self.duplicates,
                 f"{name}: {self.duplicates} rows of {table} stand in the log twice and were taken once.",
             )
@@ -204,14 +205,14 @@ class TidySignal:
         table, sensors = self.table, self.table in SENSOR_TABLES
         if self._unwrap.wraps:
             yield Finding(
-                "clock_wrapped",
+                ReasonCode.CLOCK_WRAPPED,
                 self._unwrap.wraps,
                 f"{name}: the counter behind the stamps of {table} began again {self._unwrap.wraps} time(s) after "
                 f"{self._unwrap.period_ns * 1e-9:.3f} s; its period was added.",
             )
         if self.back_ns > CLOCK_RESET_NS:
             yield Finding(
-                "clock_reset",
+                ReasonCode.CLOCK_RESET,
                 self.masked,
                 f"{name}: the stamps of {table} step back by {self.back_ns * 1e-9:.3f} s into time "
                 f"that is recorded already ({self.masked} rows): the clock was reset. Split the log where it was.",
@@ -220,7 +221,7 @@ class TidySignal:
         elif self.masked:
             what = f"set back by {self.back_ns * 1e-9:.3f} s" if self.back_ns else "set by more than a day"
             yield Finding(
-                "clock_set",
+                ReasonCode.CLOCK_SET,
                 self.masked,
                 f"{name}: the clock of {table} was {what} during the recording; its longest stretch was kept, "
                 f"{self.masked} rows beside it were left out.",
@@ -228,13 +229,13 @@ class TidySignal:
             )
         elif self.disordered:
             yield Finding(
-                "out_of_order",
+                ReasonCode.OUT_OF_ORDER,
                 self.disordered,
                 f"{name}: {self.disordered} rows of {table} came after later ones and were sorted in.",
             )
         if self.wild:
             yield Finding(
-                "wild_stamps",
+                ReasonCode.WILD_STAMPS,
                 self.wild,
                 f"{name}: {self.wild} rows of {table} carry times far from those recorded beside them and were left "
                 "out.",
@@ -243,7 +244,7 @@ class TidySignal:
         rate = self.rate_hz()
         if table == "imu" and rate is not None and not PLAUSIBLE_RATE_HZ[0] <= rate <= PLAUSIBLE_RATE_HZ[1]:
             yield Finding(
-                "implausible_rate",
+                ReasonCode.IMPLAUSIBLE_RATE,
                 self.rows,
                 f"{name}: read as they are, the stamps make the IMU sample at {rate:.4g} Hz. Correct the unit of time "
                 "(csv.time_unit) or the log.",
@@ -251,7 +252,7 @@ class TidySignal:
             )
         elif sensors and self.gaps and rate is not None and rate * GAP_NS * 1e-9 > stamps.PAUSE:
             yield Finding(
-                "gaps",
+                ReasonCode.GAPS,
                 self.gaps,
                 f"{name}: {table} pauses {self.gaps} time(s) for over {GAP_NS * 1e-9:.0f} s, at the longest for "
                 f"{self.longest_gap_ns * 1e-9:.3f} s; nothing is interpolated across.",

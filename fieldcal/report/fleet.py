@@ -9,11 +9,12 @@ from typing import Any
 
 import polars as pl
 
+from fieldcal.names import GRAVEST_FIRST, DriftStatus, Verdict
 from fieldcal.report.history import as_of_sentence, newest, usable_flights
 from fieldcal.report.key_parameter import key_parameters
 from fieldcal.report.links import Links, flight_name, vehicle_name
 from fieldcal.report.page import Column, Notice, Page, Part, Section, Table, Text, badge
-from fieldcal.report.trend import STATUSES, change_sentence, worst_status
+from fieldcal.report.trend import change_sentence, worst_status
 from fieldcal.report.words import age, day, plain_name, with_unit
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.questions import existing
@@ -48,7 +49,7 @@ def fleet_page(root: Path, links: Links, as_of: datetime | None) -> Page:
     worst = _worst_tics(warehouse, last)
     trends = {str(key[0]): part for key, part in drift.partition_by("imu_id", as_dict=True).items()}
     sparks = key_parameters(warehouse, trends)
-    rows, statuses = [], dict.fromkeys((*STATUSES, NOT_ANALYSED), 0)
+    rows, statuses = [], dict.fromkeys((*GRAVEST_FIRST, NOT_ANALYSED), 0)
     for key, part in (
         flights.sort("vehicle_id", "started_at", "flight_id").partition_by("vehicle_id", as_dict=True).items()
     ):
@@ -63,11 +64,7 @@ def fleet_page(root: Path, links: Links, as_of: datetime | None) -> Page:
     facts = [
         ("vehicles", str(len(vehicles))),
         ("flights", str(flights.height)),
-        *(
-            (verdict, str(verdicts[verdict]))
-            for verdict in ("ok", "partial", "quarantined", "rejected")
-            if verdict in verdicts
-        ),
+        *((verdict, str(verdicts[verdict])) for verdict in Verdict if verdict in verdicts),
         *((f"vehicles: {status}", str(n)) for status, n in statuses.items() if n),
     ]
     overview: list[Part] = [
@@ -145,7 +142,11 @@ def _siblings(drift: pl.DataFrame, row: Mapping[str, Any]) -> list[float]:
 
 def _unsteady(drift: pl.DataFrame) -> list[dict[str, Any]]:
     """Rows that need a look. `bias` and `zero` follow from `zero_bias`: where that says the same they are left out."""
-    found = [row for row in drift.iter_rows(named=True) if row["status"] not in ("stable", "insufficient")]
+    found = [
+        row
+        for row in drift.iter_rows(named=True)
+        if row["status"] not in (DriftStatus.STABLE, DriftStatus.INSUFFICIENT)
+    ]
     place = ("imu_id", "sensor", "method", "axis", "status")
     told = {tuple(row[name] for name in place) for row in found if row["parameter"] == "zero_bias"}
     return [
@@ -158,7 +159,7 @@ def _unsteady(drift: pl.DataFrame) -> list[dict[str, Any]]:
 def _looks(drift: pl.DataFrame, links: Links) -> list[Part]:
     if drift.is_empty():
         return [Notice("The table drift is empty: no trends have been computed yet. Status columns say so.")]
-    order = {status: i for i, status in enumerate(STATUSES)}
+    order = {status: i for i, status in enumerate(GRAVEST_FIRST)}
     found = sorted(
         _unsteady(drift),
         key=lambda row: (
@@ -171,7 +172,7 @@ def _looks(drift: pl.DataFrame, links: Links) -> list[Part]:
             row["axis"],
         ),
     )
-    few = sorted({row["imu_id"] for row in drift.iter_rows(named=True) if row["status"] == "insufficient"})
+    few = sorted({row["imu_id"] for row in drift.iter_rows(named=True) if row["status"] == DriftStatus.INSUFFICIENT})
     parts: list[Part] = []
     if found:
         columns = (
@@ -188,7 +189,7 @@ def _looks(drift: pl.DataFrame, links: Links) -> list[Part]:
                 row["imu_id"],
                 f"{plain_name(row['sensor'])} {row['parameter']} {row['axis']} ({plain_name(row['method'])})",
                 badge(row["status"]),
-                change_sentence(row, _siblings(drift, row) if row["status"] == "outlier" else []),
+                change_sentence(row, _siblings(drift, row) if row["status"] == DriftStatus.OUTLIER else []),
                 number(row["last_z"], 2),
             ]
             for row in found[:LOOKS]

@@ -7,13 +7,14 @@ from typing import Any
 
 import polars as pl
 
+from fieldcal.names import PREFERRED_METHODS, Status
 from fieldcal.report import flight_figures as draw
 from fieldcal.report.flight_curves import Curves, curves
 from fieldcal.report.flight_data import FlightData
 from fieldcal.report.flight_quality import spectra, trust
 from fieldcal.report.links import Links, vehicle_name
 from fieldcal.report.page import Column, Folded, Notice, Page, Part, Section, Table, Text, badge
-from fieldcal.report.words import METHODS, count, day, plain_name, scientific, unit, with_unit
+from fieldcal.report.words import count, day, exactness, plain_name, scientific, unit, with_unit
 from fieldcal.stages.warm_up import METHOD as WARM_UP
 from fieldcal.words.flights import QUANTITIES, advised, is_consequence, sync_sentence
 from fieldcal.words.numbers import cell, number
@@ -77,7 +78,7 @@ def _refusals(data: FlightData) -> list[Part]:
         parts.append(Notice(f"{flight['verdict']} ({flight['reason_code']}): {flight['reason']}"))
     findings = [f for f in flight["findings"] or [] if f["sentence"] != flight["reason"]]
     parts += [Text(str(finding["sentence"])) for finding in findings]
-    stopped = [row for row in data.run if row["status"] in ("refused", "failed") and row["stage"] != "ingest"]
+    stopped = [row for row in data.run if row["status"] in (Status.REFUSED, Status.FAILED) and row["stage"] != "ingest"]
     told: dict[str, list[dict[str, Any]]] = {}
     for row in stopped:
         if not is_consequence(row):
@@ -94,7 +95,7 @@ def _refusals(data: FlightData) -> list[Part]:
         parts.append(Text(f"Not run for want of their input: {', '.join(follow)}."))
     noted: dict[str, list[str]] = {}
     for row in data.run:
-        if row["status"] == "ok" and row["reason_code"] and row["measured"].get("reason") != flight["reason"]:
+        if row["status"] == Status.OK and row["reason_code"] and row["measured"].get("reason") != flight["reason"]:
             noted.setdefault(str(row["measured"].get("reason") or row["reason_code"]), []).append(row["stage"])
     parts += [Text(f"{', '.join(stages)}: {reason}") for reason, stages in noted.items()]
     parts += [Text(sentence) for sentence in advised(data.run) if not any(sentence in reason for reason in noted)]
@@ -128,7 +129,7 @@ def _constants(calibration: pl.DataFrame) -> list[Part]:
 
 def _paper_table(rows: Sequence[Mapping[str, Any]], caption: str, letter: str) -> Table:
     """Rows as the paper has them, a parameter and axis a line, a method a column, equation error first."""
-    methods = sorted({r["method"] for r in rows}, key=lambda m: -METHODS.index(m) if m in METHODS else 0)
+    methods = sorted({r["method"] for r in rows}, key=lambda m: -exactness(m) if m in PREFERRED_METHODS else 0)
     by_place = {(r["parameter"], r["axis"], r["method"]): r for r in rows}
     places = sorted(
         {(r["parameter"], r["axis"]) for r in rows},
@@ -139,7 +140,9 @@ def _paper_table(rows: Sequence[Mapping[str, Any]], caption: str, letter: str) -
         own = [by_place.get((parameter, axis, method)) for method in methods]
         known = next(r for r in own if r is not None)
         refused = [
-            f"{plain_name(r['method'])} {r['status']}: {r['reason_code']}" for r in own if r and r["status"] != "ok"
+            f"{plain_name(r['method'])} {r['status']}: {r['reason_code']}"
+            for r in own
+            if r and r["status"] != Status.OK
         ]
         state = "; ".join(refused) or badge("ok")
         symbol = f"{SYMBOLS.get(parameter, parameter)} {letter}{axis}"
@@ -266,7 +269,7 @@ def _coefficients(fit: Sequence[Mapping[str, Any]], quantity: str) -> str:
 
 def _why_no_attitude(data: FlightData) -> str:
     row = next((r for r in data.run if r["stage"] == "attitude_pass2"), None)
-    if row is not None and row["status"] in ("refused", "failed"):
+    if row is not None and row["status"] in (Status.REFUSED, Status.FAILED):
         return str(row["measured"].get("reason") or row["reason_code"])
     return "the attitude's stored table is gone." if "attitude_pass2" in data.gone else "there is no attitude."
 
@@ -274,7 +277,7 @@ def _why_no_attitude(data: FlightData) -> str:
 def _why_no_samples(data: FlightData) -> str:
     for stage in ("manoeuvre", "smoothing"):
         row = next((r for r in data.run if r["stage"] == stage), None)
-        if row is not None and row["status"] in ("refused", "failed"):
+        if row is not None and row["status"] in (Status.REFUSED, Status.FAILED):
             return str(row["measured"].get("reason") or row["reason_code"])
     return "the stages' stored tables are gone." if data.gone else "no stage ran."
 

@@ -13,13 +13,14 @@ from fieldcal.estimation.gyroscope.output_error import propagate_stretches, star
 from fieldcal.estimation.segments import begins_run, run_bounds
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, conjugate, continuous, multiply, to_rotation_vector
+from fieldcal.names import Method, Sensor
 from fieldcal.report.flight_data import FigureSettings
 from fieldcal.stages.attitude import sensor_attitude
 from fieldcal.stages.inputs import differentiate_by_segment
 from fieldcal.stages.tables import QUATERNION, constants, matrix, seconds, triad
 from fieldcal.stages.vps import RATE_COLUMNS, interpolate_attitude
 
-GYRO_METHODS = ("equation_error", "output_error", "joint")
+GYRO_METHODS = (Method.EQUATION_ERROR, Method.OUTPUT_ERROR, Method.JOINT)
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,8 @@ class Curves:
     segment: np.ndarray
     q: Array
     q_sensor: Array
-    rate: Mapping[str, Array]
-    body_rate: Mapping[str, Array]
+    rate: Mapping[Method, Array]
+    body_rate: Mapping[Method, Array]
     q_dot: Array | None
     q_dot_model: Array | None
     propagated: Array | None
@@ -64,14 +65,14 @@ def curves(
     q_sensor = continuous(sensor_attitude(q, settings))
     axes = sensor_model.frd_from_sensor(settings.rotation_body_from_sensor, settings.body)
     logged = matrix(samples, triad("gyroscope", "smoothed_"))
-    found = {m: constants(calibration, "gyroscope", m, refused_too=True) for m in GYRO_METHODS}
+    found = {m: constants(calibration, Sensor.GYROSCOPE, m, refused_too=True) for m in GYRO_METHODS}
     rate = {m: sensor_model.calibrate(logged, *own) for m, own in found.items() if own is not None and finite(own)}
     q_dot = model = propagated = None
-    if "equation_error" in rate:
+    if Method.EQUATION_ERROR in rate:
         q_dot = differentiate_by_segment(samples, q_sensor, settings.differentiation_window_s)
-        model = predicted_quaternion_rate(q_sensor, rate["equation_error"])
-    if "output_error" in rate:
-        relative = propagate_stretches(t, rate["output_error"], segment)
+        model = predicted_quaternion_rate(q_sensor, rate[Method.EQUATION_ERROR])
+    if Method.OUTPUT_ERROR in rate:
+        relative = propagate_stretches(t, rate[Method.OUTPUT_ERROR], segment)
         weight = attitude["weight"].to_numpy()
         fixed = settings.initial_attitude == "fixed"
         propagated = _same_side(start_stretches(relative, q_sensor, segment, weight, fixed=fixed), q_sensor)
@@ -106,7 +107,7 @@ def finite(own: tuple[Array, Array]) -> bool:
     return all(bool(np.isfinite(part).all()) for part in own)
 
 
-def lengths(samples: pl.DataFrame, calibration: pl.DataFrame, name: str) -> Array | None:
+def lengths(samples: pl.DataFrame, calibration: pl.DataFrame, name: Sensor) -> Array | None:
     """Calibrated vectors (n, 3) of the magnetometer or accelerometer, unsmoothed, sensor axes; None without a fit."""
     rows = calibration.filter(pl.col("value").is_not_null(), pl.col("sensor") == name)
     if rows.is_empty() or set(rows["parameter"].to_list()) < {"scale", "bias"}:

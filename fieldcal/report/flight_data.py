@@ -13,7 +13,8 @@ from fieldcal.config.stage_settings import Axes, Differentiation, Gravity, Local
 from fieldcal.errors import FieldcalError
 from fieldcal.flight.calibrate import CalibratedLog
 from fieldcal.flight.rows import rows_frame
-from fieldcal.names import InitialAttitude
+from fieldcal.names import InitialAttitude, Status
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import SIGNAL_TABLES, SchemaMismatch
 from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.warehouse import Warehouse, WarehouseError
@@ -125,9 +126,11 @@ def _one_flight(warehouse: Warehouse, wanted: str) -> pl.DataFrame:
             return found
         if found.height > 1:
             several = ", ".join(found["flight_id"].head(3).to_list())
-            raise FieldcalError("not_found", f'"{wanted}" is the start of {found.height} flight ids: {several}, …')
+            raise FieldcalError(
+                ReasonCode.NOT_FOUND, f'"{wanted}" is the start of {found.height} flight ids: {several}, …'
+            )
     raise FieldcalError(
-        "not_found", f'No flight "{wanted}" is in the history; fieldcal history --json lists flight ids.'
+        ReasonCode.NOT_FOUND, f'No flight "{wanted}" is in the history; fieldcal history --json lists flight ids.'
     )
 
 
@@ -149,7 +152,7 @@ def _stages(
     gone = []
     for row in run:
         stage = row["stage"]
-        if stage == "ingest" or row["status"] == "failed":
+        if stage == "ingest" or row["status"] == Status.FAILED:
             continue
         record = store.record(stage, flight_id, str(row["run_key"]))
         parameters |= (record or {}).get("params") or {}

@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from fieldcal.geometry.rotation import Array, continuous, euler_angles
+from fieldcal.names import Sensor, Status
 from fieldcal.report.flight_curves import Curves, covered_cells, lengths
 from fieldcal.report.flight_data import FigureSettings
 from fieldcal.report.page import Plot
@@ -89,8 +90,8 @@ def _origin(tables: Mapping[str, pl.DataFrame]) -> int:
 def spheres(samples: pl.DataFrame, calibration: pl.DataFrame, settings: FigureSettings) -> list[Plot]:
     """Figure 6: calibrated readings on their spheres; and how much of each sphere they cover."""
     radii = {
-        "magnetometer": (float(np.linalg.norm(settings.field_ned)), unit(settings.field_unit)),
-        "accelerometer": (settings.gravity_mps2, "m/s²"),
+        Sensor.MAGNETOMETER: (float(np.linalg.norm(settings.field_ned)), unit(settings.field_unit)),
+        Sensor.ACCELEROMETER: (settings.gravity_mps2, "m/s²"),
     }
     found = {name: vectors for name in radii if (vectors := lengths(samples, calibration, name)) is not None}
     if not found:
@@ -112,7 +113,7 @@ def spheres(samples: pl.DataFrame, calibration: pl.DataFrame, settings: FigureSe
         for label, setter in zip("xyz", (axis.set_xlabel, axis.set_ylabel, axis.set_zlabel), strict=True):
             setter(label, fontsize=8)
         axis.tick_params(labelsize=7, pad=-1)
-    refused = [name for name in found if (calibration.filter(pl.col("sensor") == name)["status"] != "ok").any()]
+    refused = [name for name in found if (calibration.filter(pl.col("sensor") == name)["status"] != Status.OK).any()]
     caption = "Figure 6. Calibrated readings (unsmoothed, sensor axes) on the sphere of the local field and of gravity"
     caption += f"; every {-(-max(map(len, found.values())) // SPHERE_POINTS)}th sample."
     if refused:
@@ -125,7 +126,7 @@ def spheres(samples: pl.DataFrame, calibration: pl.DataFrame, settings: FigureSe
     return [drawn, _coverage(found)]
 
 
-def _coverage(found: Mapping[str, Array]) -> Plot:
+def _coverage(found: Mapping[Sensor, Array]) -> Plot:
     figure, axes = panels(1, 2, height_in=2.9)
     told = []
     for axis in axes[0][len(found) :]:

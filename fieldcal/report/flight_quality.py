@@ -6,6 +6,7 @@ import numpy as np
 import polars as pl
 
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import Sensor
 from fieldcal.report.flight_curves import Curves, amplitude_spectrum, lengths
 from fieldcal.report.flight_data import FigureSettings
 from fieldcal.report.page import Plot
@@ -18,15 +19,15 @@ def spectra(c: Curves, samples: pl.DataFrame, calibration: pl.DataFrame, setting
     """Amplitude spectra of the residuals of every step, log-log."""
     wanted: list[tuple[str, str, list[tuple[str, tuple[Array, Array] | None]]]] = []
     radii = {
-        "magnetometer": float(np.linalg.norm(settings.field_ned)),
-        "accelerometer": settings.gravity_mps2,
+        Sensor.MAGNETOMETER: float(np.linalg.norm(settings.field_ned)),
+        Sensor.ACCELEROMETER: settings.gravity_mps2,
     }
-    vectors = []
-    for name, radius in radii.items():
-        own = lengths(samples, calibration, name)
+    vectors: list[tuple[str, tuple[Array, Array] | None]] = []
+    for sensor, radius in radii.items():
+        own = lengths(samples, calibration, sensor)
         if own is not None and len(own) == len(c.t):
             relative = (np.linalg.norm(own, axis=1) / radius - 1.0)[:, None]
-            vectors.append((name, amplitude_spectrum(c.t, relative, c.segment)))
+            vectors.append((str(sensor), amplitude_spectrum(c.t, relative, c.segment)))
     wanted.append(("length of the vectors, relative", "1/√Hz", vectors))
     if c.attitude_error_deg is not None and c.t_vps is not None and c.near is not None:
         t = c.t_vps[c.near]

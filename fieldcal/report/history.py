@@ -9,6 +9,7 @@ from typing import Any
 
 import polars as pl
 
+from fieldcal.names import Status
 from fieldcal.report.words import day
 from fieldcal.stages.warm_up import METHOD as WARM_UP
 from fieldcal.warehouse import Warehouse
@@ -24,7 +25,7 @@ def usable_flights(warehouse: Warehouse, vehicle_id: str | None = None) -> pl.Da
     """Flights that gave at least one constant, oldest first: vehicle_id, flight_id, started_at."""
     return (
         warehouse.scan("calibration", vehicle_id=vehicle_id)
-        .filter((pl.col("status") == "ok") & pl.col("value").is_not_null() & (pl.col("method") != WARM_UP))
+        .filter((pl.col("status") == Status.OK) & pl.col("value").is_not_null() & (pl.col("method") != WARM_UP))
         .select("vehicle_id", "flight_id", "started_at")
         .unique()
         .sort("vehicle_id", "started_at", "flight_id", nulls_last=False)

@@ -7,9 +7,8 @@ from typing import Any
 
 import polars as pl
 
-from fieldcal.names import INERTIAL_FIRST
+from fieldcal.names import GRAVEST_FIRST, INERTIAL_FIRST, DriftStatus, Status
 from fieldcal.report.plot import sparkline
-from fieldcal.report.trend import STATUSES
 from fieldcal.report.words import PARAMETERS, count, preferred, scientific, unit, with_unit
 from fieldcal.warehouse import Warehouse
 
@@ -23,7 +22,7 @@ def key_parameters(warehouse: Warehouse, trends: Mapping[str, pl.DataFrame]) -> 
     """For each vehicle the key parameter of its present IMU, in words and drawn. `trends`: `drift` by IMU."""
     rows = (
         warehouse.scan("calibration")
-        .filter((pl.col("status") == "ok") & pl.col("value").is_not_null())
+        .filter((pl.col("status") == Status.OK) & pl.col("value").is_not_null())
         .select("vehicle_id", "imu_id", *PLACE, "value", "unit", "started_at", "flight_id")
         .sort("started_at", "flight_id", nulls_last=False)
         .collect()
@@ -56,13 +55,14 @@ def _least_steady(drift: pl.DataFrame | None, there: set[Any]) -> dict[str, Any]
     found = [
         row
         for row in rows
-        if row["status"] not in ("stable", "insufficient") and tuple(row[name] for name in PLACE) in there
+        if row["status"] not in (DriftStatus.STABLE, DriftStatus.INSUFFICIENT)
+        and tuple(row[name] for name in PLACE) in there
     ]
     return min(found, key=_steadiness, default=None)
 
 
 def _steadiness(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    status = STATUSES.index(row["status"]) if row["status"] in STATUSES else len(STATUSES)
+    status = GRAVEST_FIRST.index(DriftStatus(row["status"])) if row["status"] in GRAVEST_FIRST else len(GRAVEST_FIRST)
     parameter = PARAMETERS.index(row["parameter"]) if row["parameter"] in PARAMETERS else len(PARAMETERS)
     return status, parameter, -abs(row["last_z"] or 0.0), *(row[name] for name in PLACE)
 

@@ -15,11 +15,15 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import fieldcal
+from fieldcal.names import DriftStatus, Status, Verdict
 
-STATUS_KIND = {
-    **dict.fromkeys(("ok", "stable"), "ok"),
-    **dict.fromkeys(("partial", "drifting", "refused", "outlier", "expired"), "look"),
-    **dict.fromkeys(("quarantined", "rejected", "failed", "step"), "bad"),
+GOOD: tuple[str, ...] = (Status.OK, DriftStatus.STABLE)
+LOOK: tuple[str, ...] = (Verdict.PARTIAL, DriftStatus.DRIFTING, Status.REFUSED, DriftStatus.OUTLIER, "expired")
+BAD: tuple[str, ...] = (Verdict.QUARANTINED, Verdict.REJECTED, Status.FAILED, DriftStatus.STEP)
+STATUS_KIND: dict[str, str] = {
+    **dict.fromkeys(GOOD, "ok"),
+    **dict.fromkeys(LOOK, "look"),
+    **dict.fromkeys(BAD, "bad"),
 }
 
 

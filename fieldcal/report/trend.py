@@ -10,10 +10,10 @@ import numpy as np
 import polars as pl
 
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import GRAVEST_FIRST, DriftStatus
 from fieldcal.report.words import count, day, scientific, with_unit
 from fieldcal.schemas.reference import REFERENCE_DEGC
 
-STATUSES = ("step", "drifting", "outlier", "stable", "insufficient")
 """Worst first; `insufficient` says nothing, so a vehicle has it only where nothing else is known."""
 
 DAY_S = 86400.0
@@ -24,13 +24,13 @@ def worst_status(drift: pl.DataFrame | None) -> str | None:
     if drift is None or drift.is_empty():
         return None
     there = set(drift["status"].to_list())
-    return next((status for status in STATUSES if status in there), min(map(str, there)))
+    return next((status for status in GRAVEST_FIRST if status in there), min(map(str, there)))
 
 
 def change_sentence(row: Mapping[str, Any], siblings: Sequence[float]) -> str:
     """What is not steady about a drift row: its own sentence, and what the siblings show of an outlier."""
     told = str(row["reason"] or "")
-    if row["status"] == "outlier" and siblings:
+    if row["status"] == DriftStatus.OUTLIER and siblings:
         median = with_unit(scientific(float(np.median(siblings))), row["unit"])
         told = f"{told} Median of {count(len(siblings), 'sibling')} at {REFERENCE_DEGC:g} °C: {median}.".strip()
     if told:

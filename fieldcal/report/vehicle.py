@@ -10,11 +10,12 @@ from typing import Any
 import polars as pl
 
 from fieldcal.errors import FieldcalError
-from fieldcal.names import SENSORS
+from fieldcal.names import GRAVEST_FIRST, SENSORS, DriftStatus, Status
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.report.history import as_of_sentence, newest, reason_of, unfold, usable_flights
 from fieldcal.report.links import Links, flight_name
 from fieldcal.report.page import Column, Folded, Heading, Notice, Page, Part, Section, Simple, Table, Text, badge
-from fieldcal.report.trend import STATUSES, change_sentence, fly_with_sentence, worst_status
+from fieldcal.report.trend import change_sentence, fly_with_sentence, worst_status
 from fieldcal.report.vehicle_figures import MOST_POINTS, agreement_plot, lag_plot, parameter_plot
 from fieldcal.report.words import PARAMETERS, age, count, day, plain_name, preferred, scientific, unit
 from fieldcal.schemas.reference import REFERENCE_DEGC
@@ -36,7 +37,7 @@ def vehicle_page(root: Path, vehicle_id: str, links: Links, as_of: datetime | No
         warehouse.scan("flight", vehicle_id=vehicle_id).sort("started_at", "flight_id", nulls_last=False).collect()
     )
     if flights.is_empty():
-        raise FieldcalError("not_found", _no_vehicle(warehouse, vehicle_id))
+        raise FieldcalError(ReasonCode.NOT_FOUND, _no_vehicle(warehouse, vehicle_id))
     moment = as_of or newest(warehouse)
     imus = list(dict.fromkeys(reversed(flights["imu_id"].to_list())))
     drift = warehouse.scan("drift").filter(pl.col("imu_id").is_in(imus)).collect()
@@ -130,7 +131,7 @@ def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
             )
         ]
     parts: list[Part] = []
-    if set(drift["status"].to_list()) == {"insufficient"}:
+    if set(drift["status"].to_list()) == {DriftStatus.INSUFFICIENT}:
         told = f"Too few flights for a trend ({count(usable, 'usable flight')}): every status is insufficient."
         why = {str(r["reason"]) for r in drift.iter_rows(named=True) if r["reason"]}
         parts.append(Notice(" ".join([told, *sorted(why)])))
@@ -144,9 +145,9 @@ def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
             r["axis"],
         ),
     )
-    moving = [r for r in ordered if r["status"] not in ("stable", "insufficient")]
-    moving.sort(key=lambda r: _place(STATUSES, r["status"]))
-    counts = [f"{n} {status}" for status in STATUSES if (n := drift.filter(pl.col("status") == status).height)]
+    moving = [r for r in ordered if r["status"] not in (DriftStatus.STABLE, DriftStatus.INSUFFICIENT)]
+    moving.sort(key=lambda r: _place(GRAVEST_FIRST, r["status"]))
+    counts = [f"{n} {status}" for status in GRAVEST_FIRST if (n := drift.filter(pl.col("status") == status).height)]
     if moving:
         columns = (
             Column("parameter"),
@@ -239,7 +240,7 @@ def _method(rows: pl.DataFrame, drift: pl.DataFrame, method: str, vehicle_id: st
     for parameter in there:
         own = rows.filter(pl.col("parameter") == parameter)
         trend = drift.filter(pl.col("method") == method, pl.col("parameter") == parameter)
-        by_axis = {r["axis"]: r for r in trend.iter_rows(named=True) if r["status"] != "insufficient"}
+        by_axis = {r["axis"]: r for r in trend.iter_rows(named=True) if r["status"] != DriftStatus.INSUFFICIENT}
         anchor = f"plot-{_slug(sensor, parameter, imu)}"
         plot = parameter_plot(own, by_axis, vehicle_id, f"{sensor} {parameter}", anchor, most)
         (parts if parameter in OPEN else folded).append(plot)
@@ -263,7 +264,7 @@ def _agreement(warehouse: Warehouse, vehicle_id: str) -> list[Part]:
 def _clock(warehouse: Warehouse, vehicle_id: str) -> list[Part]:
     sync = warehouse.scan("sync", vehicle_id=vehicle_id).collect()
     plot = lag_plot(sync, "plot-clock")
-    refused = sync.filter(pl.col("status") != "ok").height
+    refused = sync.filter(pl.col("status") != Status.OK).height
     parts: list[Part] = [Text("No flight was synchronised with a VPS.")] if plot is None else [plot]
     return [*parts, Text(f"Synchronisation was refused in {count(refused, 'flight')}.")] if refused else parts
 

@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import Status
 from fieldcal.report.page import Plot
 from fieldcal.report.plot import INK, XYZ, headed, legend_below, panels, svg
 from fieldcal.report.trend import days_after, predicted, warmed
@@ -71,7 +72,7 @@ def _panel_row(axes: Any, rows: pl.DataFrame, trend: Mapping[str, Any] | None, v
     trend = None if trend is None or trend["value_at_25degc"] is None else trend
     told = {"plain" if trend is None else "trend"}
     moments: list[datetime | None] = rows["started_at"].to_list()
-    used = (rows["status"] == "ok").to_numpy()
+    used = (rows["status"] == Status.OK).to_numpy()
     dated = [m for m in moments if m is not None]
     last = max((m for m, ok in zip(moments, used, strict=True) if m is not None and ok), default=None)
     stated = None if trend is None else trend["as_of"]
@@ -248,7 +249,7 @@ def agreement_plot(fit: pl.DataFrame, anchor: str) -> Plot | None:
 def lag_plot(sync: pl.DataFrame, anchor: str) -> Plot | None:
     """The VPS clock's lag at mid-flight and its rate over the flights."""
     good = (
-        sync.filter(pl.col("status") == "ok", pl.col("lag_mid_s").is_not_null())
+        sync.filter(pl.col("status") == Status.OK, pl.col("lag_mid_s").is_not_null())
         .sort("started_at", "flight_id")
         .tail(MOST_POINTS)
     )

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
+from fieldcal.names import PREFERRED_METHODS
 from fieldcal.words.numbers import number, with_sd
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 PARAMETERS = ("scale", "zero_bias", "bias", "zero")
-METHODS = ("joint", "output_error", "ellipsoid_robust", "ellipsoid", "equation_error")
-"""Estimators, the most exact first, as in the view `latest_calibration`."""
 
 UNITS = {"degC": "°C", "deg": "°", "1": ""}
 
@@ -52,9 +51,15 @@ def age(moment: datetime | None, as_of: datetime | None) -> str:
     return f"{days * 24:.0f} h" if days < 1 else f"{days:.0f} d"
 
 
+def exactness(method: str) -> int:
+    """Place of an estimator among all, 0 the most exact; those that nobody ordered come last."""
+    order = [str(known) for known in PREFERRED_METHODS]
+    return order.index(method) if method in order else len(order)
+
+
 def preferred(methods: set[str]) -> str:
     """The most exact of several estimators."""
-    return min(methods, key=lambda method: (METHODS.index(method) if method in METHODS else len(METHODS), method))
+    return min(methods, key=lambda method: (exactness(method), method))
 
 
 def count(n: int, what: str) -> str:

@@ -12,7 +12,8 @@ from fieldcal.estimation import wahba
 from fieldcal.estimation.faults import Fault
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, from_matrix, multiply
-from fieldcal.names import VECTOR_SENSORS, Sensor
+from fieldcal.names import VECTOR_SENSORS, Sensor, Status
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables, spread_of
 from fieldcal.stages.results import StageResult, fault_rows
 from fieldcal.stages.tables import QUATERNION, columns_of, constants, matrix, triad
@@ -79,14 +80,16 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
     fallback = []
     for name in VECTOR_SENSORS:
         if tables["samples"][f"{name}_x"].null_count() == len(tables["samples"]):
-            return StageResult(status="refused", reason_code=f"no_{name}", reason=f"Attitude needs a {name}.")
+            return StageResult(
+                status=Status.REFUSED, reason_code=ReasonCode(f"no_{name}"), reason=f"Attitude needs a {name}."
+            )
         own, fitted = vector_constants(tables, s, name)
         if not fitted:
             fallback.append(name)
         if own is None:
             return StageResult(
-                status="refused",
-                reason_code=f"{name}_refused",
+                status=Status.REFUSED,
+                reason_code=ReasonCode(f"{name}_refused"),
                 reason=f"Attitude needs a calibrated {name}; its fit was refused and raw counts are no vector.",
             )
         used[name] = own
@@ -114,7 +117,7 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
     }
     if scatter > MAX_DIP_SCATTER_DEG:
         return _contradiction(
-            "vectors_contradict",
+            ReasonCode.VECTORS_CONTRADICT,
             scatter,
             MAX_DIP_SCATTER_DEG,
             f"The angle between magnetic field and gravity scatters by {scatter:.1f}° where it should be one"
@@ -123,7 +126,7 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
         )
     if abs(expected_dip) > 20.0 and abs(dip_deg + expected_dip) < 15.0:
         return _contradiction(
-            "gravity_sign_contradiction",
+            ReasonCode.GRAVITY_SIGN_CONTRADICTION,
             dip_deg,
             expected_dip,
             f"The sensed field dips by {dip_deg:.0f}° where {expected_dip:.0f}° is configured:"
@@ -142,15 +145,17 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
             "weight": weight,
         }
     )
-    code = "logged_values_used" if fallback else None
+    code = ReasonCode.LOGGED_VALUES_USED if fallback else None
     reason = f"Logged values stand in for the refused {' and '.join(fallback)}." if fallback else None
-    return StageResult({"attitude": table}, "ok", code, reason, measured)
+    return StageResult({"attitude": table}, Status.OK, code, reason, measured)
 
 
-def _contradiction(code: str, number: float, limit: float, reason: str, measured: dict[str, object]) -> StageResult:
+def _contradiction(
+    code: ReasonCode, number: float, limit: float, reason: str, measured: dict[str, object]
+) -> StageResult:
     """A refusal that puts both vector triads in question: which of them is wrong cannot be told."""
     rows = [Fault(name, "", code, number, limit, True, reason) for name in VECTOR_SENSORS]
-    return StageResult({"faults": fault_rows(rows)}, "refused", code, reason, measured)
+    return StageResult({"faults": fault_rows(rows)}, Status.REFUSED, code, reason, measured)
 
 
 def _dip_deg(vectors: Array) -> Array:

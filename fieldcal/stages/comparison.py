@@ -16,6 +16,8 @@ from fieldcal.estimation.motion_selection import contiguous
 from fieldcal.estimation.theil import Fit, theil, theil_attitude
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, continuous, slerp
+from fieldcal.names import Method, Sensor, Status
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import body_vectors, known_vectors, sensor_attitude
 from fieldcal.stages.inputs import Tables, differentiate_by_segment, spread_of
 from fieldcal.stages.results import StageResult
@@ -49,8 +51,8 @@ def verify_fit(tables: Tables, s: VerifySettings) -> StageResult:
     if attitude is not None:
         sides = {"raw": _raw_attitude(tables, s), "smoothed": matrix(attitude, QUATERNION)}
     gyros = {
-        method: constants(tables["gyroscope"], "gyroscope", method, refused_too=True)
-        for method in ("equation_error", "output_error")
+        method: constants(tables["gyroscope"], Sensor.GYROSCOPE, method, refused_too=True)
+        for method in (Method.EQUATION_ERROR, Method.OUTPUT_ERROR)
         if "gyroscope" in tables
     }
     vps = tables.get("vps_aligned")
@@ -75,7 +77,7 @@ def verify_fit(tables: Tables, s: VerifySettings) -> StageResult:
             if own_constants is None:
                 continue
             rate = sensor_model.calibrate(rate_logged, *own_constants)
-            if method == "equation_error":
+            if method == Method.EQUATION_ERROR:
                 q_dot = differentiate_by_segment(samples, q_sensor, s.differentiation_window_s)
                 add(
                     "quaternion_rate",
@@ -94,7 +96,7 @@ def verify_fit(tables: Tables, s: VerifySettings) -> StageResult:
                     _propagated_against_vps(add, method, signal, t, relative, segment, vps, vps_t, s)
             if vps is not None and vps_t is not None:
                 _rates_against_vps(add, method, signal, t, rate @ axes.T, vps, vps_t, s)
-    joint = constants(tables["joint"], "gyroscope") if "joint" in tables else None
+    joint = constants(tables["joint"], Sensor.GYROSCOPE) if "joint" in tables else None
     if joint is not None and vps is not None and vps_t is not None:
         q = matrix(tables["trajectory"], QUATERNION)
         own, near = interpolate_attitude(t, continuous(q), vps_t)
@@ -108,7 +110,9 @@ def verify_fit(tables: Tables, s: VerifySettings) -> StageResult:
     if "held_out" in tables:
         _held_out(add, tables, t, segment, vps, vps_t, s)
     if not rows:
-        return StageResult(status="absent", reason_code="nothing_to_compare", reason="No reference to compare with.")
+        return StageResult(
+            status=Status.ABSENT, reason_code=ReasonCode.NOTHING_TO_COMPARE, reason="No reference to compare with."
+        )
     return StageResult({"fit": pl.DataFrame(rows, schema=FIT_SCHEMA)}, measured={"comparisons": len(rows)})
 
 
@@ -146,7 +150,7 @@ def _held_out(
 ) -> None:
     """Constants of the first part of the flight predict the rest: attitude over stretches, and body rates, against the
     VPS, else against the joint attitude of the whole flight."""
-    constants_then = constants(tables["held_out"], "gyroscope")
+    constants_then = constants(tables["held_out"], Sensor.GYROSCOPE)
     if constants_then is None:
         return
     late = tables["samples"]["t_ns"].to_numpy() >= tables["held_out"]["from_ns"][0]

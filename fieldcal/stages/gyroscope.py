@@ -24,7 +24,8 @@ from fieldcal.estimation.statistics import white_noise_sigma
 from fieldcal.estimation.uncertainty_propagation import attitude_jacobian, constants_to_equation, constants_to_gyro
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import VECTOR_SENSORS, Sensor
+from fieldcal.names import VECTOR_SENSORS, Method, Sensor, Status
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import body_vectors, known_vectors, logged_constants, sensor_attitude
 from fieldcal.stages.inputs import (
     Tables,
@@ -73,7 +74,9 @@ def _equation_error(tables: Tables, s: GyroEquationSettings, triads: TriadUncert
     samples, attitude = tables["samples"], tables["attitude"]
     logged = matrix(samples, triad("gyroscope", "smoothed_"))
     if np.isnan(logged).any():
-        return StageResult(status="refused", reason_code="no_gyroscope", reason="The log has no gyroscope readings.")
+        return StageResult(
+            status=Status.REFUSED, reason_code=ReasonCode.NO_GYROSCOPE, reason="The log has no gyroscope readings."
+        )
     q = sensor_attitude(matrix(attitude, QUATERNION), s)
     weight = attitude["weight"].to_numpy()
     noise_variance = smoothed_noise_variance(
@@ -106,25 +109,25 @@ def _equation_error(tables: Tables, s: GyroEquationSettings, triads: TriadUncert
         "residual_rms": fit.residual_rms,
         "noise_share_of_regressor": [float(v) for v in noise_variance / logged.var(axis=0)],
     }
-    return _gyro_result("equation_error", fit, covariance, tables, s, measured)
+    return _gyro_result(Method.EQUATION_ERROR, fit, covariance, tables, s, measured)
 
 
 def _gyro_result(
-    method: str, fit: GyroFit, covariance: Array, tables: Tables, s: GyroSettings, measured: dict[str, Any]
+    method: Method, fit: GyroFit, covariance: Array, tables: Tables, s: GyroSettings, measured: dict[str, Any]
 ) -> StageResult:
     """Gyroscope rows with a status by axis: sign against polarity, size against nominal, claimed sd."""
     relative = np.sqrt(np.diagonal(covariance)[:3]) / np.abs(fit.scale)
     sign_wrong = np.sign(fit.scale) != np.sign(np.asarray(s.polarity[Sensor.GYROSCOPE], dtype=float))
-    codes: list[str | None] = [None] * 3
+    codes: list[ReasonCode | None] = [None] * 3
     nominal = s.nominal_scale[Sensor.GYROSCOPE]
     for i in range(3):
         ratio = 1.0 if nominal is None else abs(fit.scale[i]) / abs(nominal[i])
         if not relative[i] <= s.gyro_max_scale_sd:
-            codes[i] = "scale_uncertain"
+            codes[i] = ReasonCode.SCALE_UNCERTAIN
         elif sign_wrong[i]:
-            codes[i] = "polarity_contradiction"
+            codes[i] = ReasonCode.POLARITY_CONTRADICTION
         elif not 0.5 <= ratio <= 2.0:
-            codes[i] = "scale_not_nominal"
+            codes[i] = ReasonCode.SCALE_NOT_NOMINAL
     measured = {
         **measured,
         "n_samples": fit.n_samples,
@@ -135,7 +138,7 @@ def _gyro_result(
         ],
     }
     rows = triad_rows(
-        "gyroscope",
+        Sensor.GYROSCOPE,
         method,
         np.diag(fit.scale),
         fit.bias,
@@ -144,11 +147,10 @@ def _gyro_result(
         logged_unit=s.units[Sensor.GYROSCOPE],
         reference_reading=reference_reading(s, Sensor.GYROSCOPE, matrix(tables["samples"], triad("gyroscope"))),
         temperature_degc=mean_temperature(tables),
-        status=tuple("ok" if c is None else "refused" for c in codes),  # type: ignore[arg-type]
-        reason_code=tuple(codes),  # type: ignore[arg-type]
+        reason_code=codes,
     )
     bad = [f"{axis}: {code}" for axis, code in zip(AXES, codes, strict=True) if code]
-    status = "refused" if len(bad) == 3 else "ok"
+    status = Status.REFUSED if len(bad) == 3 else Status.OK
     reason = GYRO_REASONS.format(axes=", ".join(bad)) if bad else None
     first = next((c for c in codes if c), None)
     result = {"calibration": calibration_rows(rows), "covariance": covariance_table(covariance)}
@@ -167,9 +169,9 @@ def calibrate_gyro_output(tables: Tables, s: GyroOutputSettings) -> StageResult:
     output = result.tables["calibration"]
     wrong = _contradicted(equation, output)
     judged = equation.with_columns(
-        status=pl.when(pl.col("axis").is_in(wrong)).then(pl.lit("refused")).otherwise("status"),
+        status=pl.when(pl.col("axis").is_in(wrong)).then(pl.lit(Status.REFUSED)).otherwise("status"),
         reason_code=pl.when(pl.col("axis").is_in(wrong))
-        .then(pl.lit("contradicted_by_output_error"))
+        .then(pl.lit(ReasonCode.CONTRADICTED_BY_OUTPUT_ERROR))
         .otherwise("reason_code"),
     )
     measured = {**result.measured, "equation_error_contradicted": wrong}
@@ -179,8 +181,8 @@ def calibrate_gyro_output(tables: Tables, s: GyroOutputSettings) -> StageResult:
 def _contradicted(equation: pl.DataFrame, output: pl.DataFrame) -> list[str]:
     """Axes whose equation-error scale differs from output error's by more than 3 sd of both and 1 %."""
     pairs = (
-        equation.filter(parameter="scale", status="ok")
-        .join(output.filter(parameter="scale", status="ok"), on="axis", suffix="_oe")
+        equation.filter(parameter="scale", status=Status.OK)
+        .join(output.filter(parameter="scale", status=Status.OK), on="axis", suffix="_oe")
         .filter(
             (pl.col("value") - pl.col("value_oe")).abs()
             > pl.max_horizontal(
@@ -194,7 +196,9 @@ def _contradicted(equation: pl.DataFrame, output: pl.DataFrame) -> list[str]:
 def _output_error(tables: Tables, s: GyroOutputSettings) -> StageResult:
     """Output error's own rows."""
     if not s.gyro_output:
-        return StageResult(status="absent", reason_code="switched_off", reason="Output error is switched off.")
+        return StageResult(
+            status=Status.ABSENT, reason_code=ReasonCode.SWITCHED_OFF, reason="Output error is switched off."
+        )
     samples, attitude = tables["samples"], tables["attitude"]
     logged = matrix(samples, triad("gyroscope"))
     t = seconds(samples["t_ns"], samples["t_ns"][0])
@@ -222,8 +226,8 @@ def _output_error(tables: Tables, s: GyroOutputSettings) -> StageResult:
     }
     if median > MAX_MEDIAN_ATTITUDE_ERROR_RAD:
         return StageResult(
-            status="refused",
-            reason_code="gyro_contradicts_attitude",
+            status=Status.REFUSED,
+            reason_code=ReasonCode.GYRO_CONTRADICTS_ATTITUDE,
             reason=f"The integrated gyroscope misses the attitude by {np.degrees(median):.0f}° (median): wrong"
             " polarity, axes or units of a sensor, or attitudes spoiled by acceleration.",
             measured=measured,
@@ -232,7 +236,7 @@ def _output_error(tables: Tables, s: GyroOutputSettings) -> StageResult:
     measured["propagated_share_of_variance"] = [
         float(v) for v in np.diagonal(propagated)[:3] / np.diagonal(fit.covariance + propagated)[:3]
     ]
-    return _gyro_result("output_error", fit, fit.covariance + propagated, tables, s, measured)
+    return _gyro_result(Method.OUTPUT_ERROR, fit, fit.covariance + propagated, tables, s, measured)
 
 
 def _start(

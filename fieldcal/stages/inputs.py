@@ -9,12 +9,14 @@ import numpy as np
 import polars as pl
 
 from fieldcal.config.stage_settings import ReferenceReading
+from fieldcal.errors import FieldcalError
 from fieldcal.estimation import smoothing
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.statistics import robust_sigma
 from fieldcal.geometry.rotation import Array
 from fieldcal.geometry.sensor_model import default_reference_reading
-from fieldcal.names import Sensor
+from fieldcal.names import Sensor, Status
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.results import StageResult, fatal_fault
 
 Tables = Mapping[str, pl.DataFrame]
@@ -62,10 +64,10 @@ def spread_of(excess: Array) -> float:
 
 def refusal(error: Exception, name: str, measured: Mapping[str, Any] | None = None) -> StageResult:
     """A refusal without a result, from whatever the numerics raised."""
-    code = getattr(error, "reason_code", "unusable_readings")
+    code = error.reason_code if isinstance(error, FieldcalError) else ReasonCode.UNUSABLE_READINGS
     return StageResult(
-        status="refused",
+        status=Status.REFUSED,
         reason_code=code,
         reason=f"{name.capitalize()}: {error}",
-        measured={**(measured or {}), **getattr(error, "measured", {})},
+        measured={**(measured or {}), **(error.measured if isinstance(error, FieldcalError) else {})},
     )

@@ -18,7 +18,8 @@ from fieldcal.estimation.joint.problem import TERMS, Readings
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array, from_matrix, multiply
-from fieldcal.names import SENSORS, Approach, Sensor
+from fieldcal.names import SENSORS, Approach, Method, Sensor, Status
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Tables, is_sound, mean_temperature, reference_reading, refusal
 from fieldcal.stages.joint_reference import Poses, poses_of, with_poses
@@ -35,11 +36,10 @@ from fieldcal.stages.tables import (
     triad,
 )
 
-METHOD = "joint"
-SERIAL_METHODS: dict[Sensor, tuple[str | None, ...]] = {
+SERIAL_METHODS: dict[Sensor, tuple[Method | None, ...]] = {
     Sensor.MAGNETOMETER: (None,),
     Sensor.ACCELEROMETER: (None,),
-    Sensor.GYROSCOPE: ("output_error", "equation_error"),
+    Sensor.GYROSCOPE: (Method.OUTPUT_ERROR, Method.EQUATION_ERROR),
 }
 UNITS = {Sensor.MAGNETOMETER: "", Sensor.ACCELEROMETER: "m/s^2", Sensor.GYROSCOPE: "rad/s"}
 # A magnetometer's readings count as one each only where they are about as many as the gyroscope's.
@@ -51,14 +51,18 @@ MAX_GYRO_NOISE_SHARE = 0.5
 def estimate_jointly(tables: Tables, s: JointSettings) -> StageResult:
     """samples, serial constants → calibration, covariance, trajectory, held_out: everything in one likelihood."""
     if not chosen(s):
-        return StageResult(status="absent", reason_code="not_selected", reason='The method is "serial".')
+        return StageResult(status=Status.ABSENT, reason_code=ReasonCode.NOT_SELECTED, reason='The method is "serial".')
     if "samples" not in tables:
-        return StageResult(status="refused", reason_code="no_samples", reason="No segment of the log is usable.")
+        return StageResult(
+            status=Status.REFUSED, reason_code=ReasonCode.NO_SAMPLES, reason="No segment of the log is usable."
+        )
     fault = fatal_fault(tables["faults"], ("gyroscope",)) if "faults" in tables else None
     if fault is not None:
-        return StageResult(status="refused", reason_code=fault["reason_code"], reason=fault["reason"])
+        return StageResult(status=Status.REFUSED, reason_code=ReasonCode(fault["reason_code"]), reason=fault["reason"])
     if tables["samples"]["gyroscope_x"].null_count():
-        return StageResult(status="refused", reason_code="no_gyroscope", reason="The joint estimate needs a gyroscope.")
+        return StageResult(
+            status=Status.REFUSED, reason_code=ReasonCode.NO_GYROSCOPE, reason="The joint estimate needs a gyroscope."
+        )
     readings = readings_of(tables, s)
     axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
     arm = None if s.lever_arm_m is None else axes.T @ np.asarray(s.lever_arm_m, dtype=float)
@@ -104,8 +108,8 @@ def _held_out(
         return {}
     matrix, bias, covariance, _ = _triad(own, "gyroscope")
     rows = triad_rows(
-        "gyroscope",
-        METHOD,
+        Sensor.GYROSCOPE,
+        Method.JOINT,
         matrix,
         bias,
         covariance,
@@ -180,7 +184,7 @@ def start_constants(tables: Tables, s: JointSettings, readings: Readings) -> dic
 def _written(fit: JointFit, tables: Tables, s: JointSettings, axes: Array) -> StageResult:
     """Rows with a status by sensor and axis, the attitude, the covariance, and the numbers that decided."""
     rows: list[dict[str, Any]] = []
-    codes: dict[Sensor, list[str | None]] = {}
+    codes: dict[Sensor, list[ReasonCode | None]] = {}
     for name in chosen(s):
         if name not in fit.layout:
             continue
@@ -188,7 +192,7 @@ def _written(fit: JointFit, tables: Tables, s: JointSettings, axes: Array) -> St
         codes[name] = _judged(name, fit, np.diagonal(full), covariance, s)
         rows += triad_rows(
             name,
-            METHOD,
+            Method.JOINT,
             full,
             bias,
             covariance,
@@ -196,8 +200,7 @@ def _written(fit: JointFit, tables: Tables, s: JointSettings, axes: Array) -> St
             logged_unit=s.units[name],
             reference_reading=reference_reading(s, name, matrix(tables["samples"], triad(name))),
             temperature_degc=mean_temperature(tables),
-            status=tuple("refused" if code else "ok" for code in codes[name]),  # type: ignore[arg-type]
-            reason_code=tuple(codes[name]),  # type: ignore[arg-type]
+            reason_code=codes[name],
             cross_sd=cross_sd,
         )
     if Sensor.GYROSCOPE in codes:
@@ -208,12 +211,15 @@ def _written(fit: JointFit, tables: Tables, s: JointSettings, axes: Array) -> St
     first = next((code for own in codes.values() for code in own if code), None)
     reason = f"Refused by the joint estimate ({', '.join(bad)}). {measured['advice']}".strip() if bad else None
     if not codes:
-        first, reason = f"no_{chosen(s)[0]}", "None of the sensors that method joint is chosen for has readings."
+        first, reason = (
+            ReasonCode(f"no_{chosen(s)[0]}"),
+            "None of the sensors that method joint is chosen for has readings.",
+        )
     result = {"calibration": calibration_rows(rows), "covariance": covariance_table(fit.covariance)}
     full, _, covariance, _ = _triad(fit, "gyroscope")
     if not any(_judged(Sensor.GYROSCOPE, fit, np.diagonal(full), covariance, s)):
         result["trajectory"] = _trajectory(fit, tables, axes)
-    return StageResult(result, "refused" if every else "ok", first, reason, measured)
+    return StageResult(result, Status.REFUSED if every else Status.OK, first, reason, measured)
 
 
 def _triad(fit: JointFit, name: str) -> tuple[Array, Array, Array, Array | None]:
@@ -227,7 +233,9 @@ def _triad(fit: JointFit, name: str) -> tuple[Array, Array, Array, Array | None]
     return full, bias, covariance[own], np.sqrt(np.diagonal(covariance)[:9]).reshape(3, 3)
 
 
-def _slope_rows(fit: JointFit, tables: Tables, s: JointSettings, codes: list[str | None]) -> list[dict[str, Any]]:
+def _slope_rows(
+    fit: JointFit, tables: Tables, s: JointSettings, codes: list[ReasonCode | None]
+) -> list[dict[str, Any]]:
     """The gyroscope's zero against temperature, where the flight shows it."""
     if "gyroscope_temperature" not in fit.layout:
         return []
@@ -235,8 +243,8 @@ def _slope_rows(fit: JointFit, tables: Tables, s: JointSettings, codes: list[str
     value = -fit.state.values["gyroscope_temperature"] * spread
     sd = np.sqrt(np.diagonal(fit.covariance)[fit.layout["gyroscope_temperature"]]) * spread
     return zero_slope_rows(
-        "gyroscope",
-        METHOD,
+        Sensor.GYROSCOPE,
+        Method.JOINT,
         value,
         sd,
         logged_unit=s.units[Sensor.GYROSCOPE],
@@ -245,31 +253,31 @@ def _slope_rows(fit: JointFit, tables: Tables, s: JointSettings, codes: list[str
     )
 
 
-def _judged(name: Sensor, fit: JointFit, scale: Array, covariance: Array, s: JointSettings) -> list[str | None]:
+def _judged(name: Sensor, fit: JointFit, scale: Array, covariance: Array, s: JointSettings) -> list[ReasonCode | None]:
     """Why an axis is refused, or None."""
     if name == Sensor.GYROSCOPE:
         if gyro_noise_share(fit) > MAX_GYRO_NOISE_SHARE:
-            return ["gyro_contradicts_attitude"] * 3
+            return [ReasonCode.GYRO_CONTRADICTS_ATTITUDE] * 3
         limit = s.gyro_max_scale_sd
     else:
         if misfit(fit, name) > s.ellipsoid_max_residual:
-            return ["not_a_sphere"] * 3
+            return [ReasonCode.NOT_A_SPHERE] * 3
         limit = s.ellipsoid_max_scale_sd
     relative = np.sqrt(np.diagonal(covariance)[:3]) / np.abs(scale)
     polarity = np.array(s.polarity[name], dtype=np.float64)
     nominal = s.nominal_scale[name]
     noisy = axis_noise_share(fit) > MAX_GYRO_NOISE_SHARE if name == Sensor.GYROSCOPE else np.zeros(3, dtype=bool)
-    out: list[str | None] = []
+    out: list[ReasonCode | None] = []
     for i in range(3):
         ratio = 1.0 if nominal is None else abs(scale[i] / nominal[i])
         if not relative[i] <= limit:
-            out.append("scale_uncertain")
+            out.append(ReasonCode.SCALE_UNCERTAIN)
         elif noisy[i]:
-            out.append("axis_not_turned")
+            out.append(ReasonCode.AXIS_NOT_TURNED)
         elif np.sign(scale[i]) != polarity[i]:
-            out.append("polarity_contradiction")
+            out.append(ReasonCode.POLARITY_CONTRADICTION)
         else:
-            out.append(None if 0.5 <= ratio <= 2.0 else "scale_not_nominal")
+            out.append(None if 0.5 <= ratio <= 2.0 else ReasonCode.SCALE_NOT_NOMINAL)
     return out
 
 

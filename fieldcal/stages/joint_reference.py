@@ -14,6 +14,7 @@ from fieldcal.estimation.joint.fit import JointFit, fit_joint
 from fieldcal.estimation.joint.pose_measurement import VpsRecord
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, continuous, to_rotation_vector
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import sensor_attitude
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.tables import QUATERNION, matrix, seconds
@@ -63,7 +64,7 @@ def with_poses(fit: JointFit, poses: Poses | None, s: VpsReference) -> tuple[Joi
         )
         vps = VpsRecord.of(poses.t, poses.q, clock, fit.model, fit.state, fit.path, max_gap_s=poses.max_gap_s)
         if vps is None:
-            return fit, {"use_vps": False, "use_vps_reason": "vps_too_short"}
+            return fit, {"use_vps": False, "use_vps_reason": ReasonCode.VPS_TOO_SHORT}
         start = replace(fit.state, values={**fit.state.values, **vps.start()})
         own = fit_joint(fit.model, start, try_lever_arm="lever_arm" in fit.layout, vps=vps, levels=fit.levels)
     except (UnusableFlight, EstimationError) as error:

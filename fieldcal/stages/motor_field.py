@@ -16,6 +16,7 @@ from fieldcal.geometry import sensor_model
 from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Sensor
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables, in_used_segments
 from fieldcal.stages.results import fatal_fault
 from fieldcal.stages.tables import constants, matrix, triad
@@ -68,7 +69,7 @@ def check_motor_field(tables: Tables, s: VectorsSettings) -> tuple[dict[str, Any
 def _approximate(tables: Tables, s: VectorsSettings, values: Array) -> tuple[Array, Array] | None:
     """Scale and bias to start from: the magnetometer's, of a refused fit too (the current may be why it was refused),
     else the algebraic fit's; what a constant ellipsoid lacks is fitted beside the current's field."""
-    own = constants(tables["magnetometer"], "magnetometer", refused_too=True) if "magnetometer" in tables else None
+    own = constants(tables["magnetometer"], Sensor.MAGNETOMETER, refused_too=True) if "magnetometer" in tables else None
     if own is not None and all(np.isfinite(c).all() for c in own):
         return own
     strength, polarity = float(np.linalg.norm(s.field_ned)), s.polarity[Sensor.MAGNETOMETER]
@@ -99,4 +100,4 @@ def _outside(throttle: Array) -> Fault | None:
         " magnetometer. Convert the column, or name the current's as csv.imu.current."
     )
     worst = high if high > 1.0 else low
-    return Fault("throttle", "", "throttle_range", worst, 1.0 if high > 1.0 else 0.0, False, sentence)
+    return Fault("throttle", "", ReasonCode.THROTTLE_RANGE, worst, 1.0 if high > 1.0 else 0.0, False, sentence)

@@ -34,7 +34,8 @@ from fieldcal.config.stage_settings import (
     names_of,
     taken_from,
 )
-from fieldcal.names import VECTOR_SENSORS, Sensor
+from fieldcal.names import VECTOR_SENSORS, Sensor, Status
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import SchemaMismatch, conform
 from fieldcal.stages import attitude, comparison, gyroscope, joint, preparation, sanity, vector_triads, vps, warm_up
 from fieldcal.stages.inputs import Tables
@@ -311,8 +312,8 @@ def refused_beforehand(stage: Stage, inputs: Mapping[str, pl.DataFrame]) -> Stag
         fault = fatal_fault(inputs[faults], sensors) if faults in inputs else None
         if fault is not None:
             return StageResult(
-                status="refused",
-                reason_code=str(fault["reason_code"]),
+                status=Status.REFUSED,
+                reason_code=ReasonCode(fault["reason_code"]),
                 reason=str(fault["reason"]),
                 measured={"number": fault["number"], "limit": fault["limit"]},
             )
@@ -320,8 +321,8 @@ def refused_beforehand(stage: Stage, inputs: Mapping[str, pl.DataFrame]) -> Stag
         if need not in inputs:
             source = stage.reads[need].split(".")[0]
             return StageResult(
-                status="refused",
-                reason_code=f"no_{need}",
+                status=Status.REFUSED,
+                reason_code=ReasonCode(f"no_{need}"),
                 reason=f"{stage.name} needs {stage.reads[need]}, which {source} could not give.",
             )
     return None

@@ -12,6 +12,8 @@ from fieldcal.estimation import motion_selection, smoothing
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import Status
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import columns_of, matrix, seconds, triad
@@ -63,8 +65,8 @@ def find_manoeuvre(tables: Tables, s: ManoeuvreSettings) -> StageResult:
     if found.excited_s < s.manoeuvre_min_s:
         return StageResult(
             {"segments": segments.with_columns(used=pl.lit(False))},
-            "refused",
-            "too_little_motion",
+            Status.REFUSED,
+            ReasonCode.TOO_LITTLE_MOTION,
             f"Only {found.excited_s:.1f} s of rotation were found, {s.manoeuvre_min_s:.0f} s are needed: fly the"
             " manoeuvre (roll, pitch and yaw doublets).",
             measured,
@@ -76,7 +78,9 @@ def smooth(tables: Tables, s: SmoothingSettings) -> StageResult:
     """imu, magnetometer, segments → samples: readings of the used segments at the IMU's stamps, logged and smoothed."""
     imu, segments = tables["imu"], tables["segments"].filter(pl.col("used"))
     if segments.is_empty():
-        return StageResult(status="refused", reason_code="no_manoeuvre", reason="No segment of the log is usable.")
+        return StageResult(
+            status=Status.REFUSED, reason_code=ReasonCode.NO_MANOEUVRE, reason="No segment of the log is usable."
+        )
     origin = int(imu["t_ns"][0])
     stamps = imu["t_ns"].to_numpy()
     logged = np.column_stack(
@@ -93,7 +97,9 @@ def smooth(tables: Tables, s: SmoothingSettings) -> StageResult:
         )
         parts.append({"t_ns": stamps[rows], "segment": np.full(len(x), number, dtype=np.int32), "x": x, "s": smoothed})
     if not parts:
-        return StageResult(status="refused", reason_code="no_manoeuvre", reason="The magnetometer pauses throughout.")
+        return StageResult(
+            status=Status.REFUSED, reason_code=ReasonCode.NO_MANOEUVRE, reason="The magnetometer pauses throughout."
+        )
     joined = {k: np.concatenate([p[k] for p in parts]) for k in ("t_ns", "segment", "x", "s")}
     names = triad("gyroscope") + triad("accelerometer") + triad("magnetometer")
     samples = pl.DataFrame(

@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike
 
 from fieldcal.estimation.faults import Fault
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import Method, Sensor, Status
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.tables import AXES
 
 
@@ -20,13 +22,12 @@ from fieldcal.stages.tables import AXES
 class StageResult:
     """Tables that a stage made, how it ended and the numbers that decided it.
 
-    `status`: "ok"; "refused": the recording does not determine it (tables may still carry refused values); "absent":
-    there is nothing to do (no VPS in the log); "failed": an error of ours, told in `reason`.
+    Tables of a refused stage may still carry refused values; an error of ours is told in `reason`.
     """
 
     tables: dict[str, pl.DataFrame] = field(default_factory=dict)
-    status: str = "ok"
-    reason_code: str | None = None
+    status: Status = Status.OK
+    reason_code: ReasonCode | None = None
     reason: str | None = None
     measured: dict[str, Any] = field(default_factory=dict)
 
@@ -56,8 +57,8 @@ def fatal_fault(faults: pl.DataFrame, sensors: tuple[str, ...]) -> dict[str, Any
 
 
 def triad_rows(
-    sensor: str,
-    method: str,
+    sensor: Sensor,
+    method: Method,
     scale: ArrayLike,
     bias: ArrayLike,
     covariance: Array,
@@ -66,8 +67,7 @@ def triad_rows(
     logged_unit: str,
     reference_reading: ArrayLike,
     temperature_degc: float | None,
-    status: tuple[str, str, str] = ("ok", "ok", "ok"),
-    reason_code: tuple[str | None, str | None, str | None] = (None, None, None),
+    reason_code: Sequence[ReasonCode | None] = (None, None, None),
     cross_sd: Array | None = None,
 ) -> list[dict[str, Any]]:
     """Rows scale, bias, zero and zero_bias of one triad with their standard deviations.
@@ -93,7 +93,7 @@ def triad_rows(
                 "sd": float(np.sqrt(variance)) if finite and variance is not None else None,
                 "unit": row_unit,
                 "temperature_degc": temperature_degc,
-                "status": status[i],
+                "status": Status.REFUSED if reason_code[i] else Status.OK,
                 "reason_code": reason_code[i],
             }
         )
@@ -120,14 +120,14 @@ def triad_rows(
 
 
 def zero_slope_rows(
-    sensor: str,
-    method: str,
+    sensor: Sensor,
+    method: Method,
     slope: ArrayLike,
     sd: ArrayLike,
     *,
     logged_unit: str,
     temperature_degc: float | None,
-    reason_code: Sequence[str | None] = (None, None, None),
+    reason_code: Sequence[ReasonCode | None] = (None, None, None),
 ) -> list[dict[str, Any]]:
     """Rows zero_per_degc of one triad: slope (3,) of its zero on temperature and sd (3,), logged units per °C; an axis
     with a reason code is refused."""
@@ -142,7 +142,7 @@ def zero_slope_rows(
             "sd": float(own_sd),
             "unit": unit,
             "temperature_degc": temperature_degc,
-            "status": "refused" if code else "ok",
+            "status": Status.REFUSED if code else Status.OK,
             "reason_code": code,
         }
         for axis, value, own_sd, code in zip(AXES, np.asarray(slope), np.asarray(sd), reason_code, strict=True)

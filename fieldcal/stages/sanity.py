@@ -10,6 +10,7 @@ from fieldcal.estimation.faults import Fault
 from fieldcal.geometry.earth_field import UNIT_IN_TESLA
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Sensor
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.results import StageResult, fault_rows
 from fieldcal.stages.tables import matrix, seconds, triad
@@ -52,5 +53,5 @@ def _faults_of(sensor: Sensor, t: Array, readings: Array, s: SanitySettings) -> 
         wrong = faults.accelerometer_unit(readings, unit, si_scale, s.gravity_mps2)
     elif sensor == Sensor.GYROSCOPE and si_scale is not None:
         wrong = faults.gyroscope_unit(readings, unit, si_scale)
-    dead = any(f.code in ("all_zero", "stuck") and f.fatal for f in found)
+    dead = any(f.code in (ReasonCode.ALL_ZERO, ReasonCode.STUCK) and f.fatal for f in found)
     return [*found, *([wrong] if wrong and not dead else []), *faults.sampling_faults(sensor, t)]

@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import Method, Sensor, Status
 
 AXES = ("x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -72,14 +73,14 @@ def covariance_of(table: pl.DataFrame) -> Array:
 
 
 def constants(
-    calibration: pl.DataFrame, sensor: str, method: str | None = None, *, refused_too: bool = False
+    calibration: pl.DataFrame, sensor: Sensor, method: Method | None = None, *, refused_too: bool = False
 ) -> tuple[Array, Array] | None:
     """(Λ (3, 3), b (3,)) of a sensor from `calibration` rows; None where there are none, or (normally) one is
     refused."""
     rows = calibration.filter(pl.col("sensor") == sensor)
     if method is not None:
         rows = rows.filter(pl.col("method") == method)
-    if rows.is_empty() or (not refused_too and (rows["status"] != "ok").any()):
+    if rows.is_empty() or (not refused_too and (rows["status"] != Status.OK).any()):
         return None
     value = {(p, a): v for p, a, v in rows.select("parameter", "axis", "value").iter_rows()}
     bias = np.array([value["bias", a] for a in AXES])

@@ -20,7 +20,8 @@ from fieldcal.estimation import ellipsoid, motion_selection
 from fieldcal.estimation.ellipsoid import TriadFit
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import VECTOR_SENSORS, Sensor, Triple
+from fieldcal.names import VECTOR_SENSORS, EllipsoidFit, Method, Sensor, Status, Triple
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import (
     Tables,
@@ -34,12 +35,12 @@ from fieldcal.stages.motor_field import check_motor_field
 from fieldcal.stages.results import StageResult, fatal_fault, fault_rows, triad_rows
 from fieldcal.stages.tables import calibration_rows, constants, covariance_table, matrix, seconds, triad
 
-ELLIPSOID_METHOD = {
-    "robust": "ellipsoid_robust",
-    "li": "ellipsoid",
-    "li_full": "ellipsoid_full",
-    "two_step": "ellipsoid_two_step",
-    "tls": "ellipsoid_tls",
+ELLIPSOID_METHOD: dict[EllipsoidFit, Method] = {
+    "robust": Method.ELLIPSOID_ROBUST,
+    "li": Method.ELLIPSOID,
+    "li_full": Method.ELLIPSOID_FULL,
+    "two_step": Method.ELLIPSOID_TWO_STEP,
+    "tls": Method.ELLIPSOID_TLS,
 }
 
 
@@ -64,7 +65,7 @@ def calibrate_accelerometer(tables: Tables, s: AccelerometerSettings) -> StageRe
     wide = replace(s, ellipsoid_max_scale_sd=PROVISIONAL, ellipsoid_max_residual=PROVISIONAL)
     logged = _used_readings(tables, Sensor.ACCELEROMETER)
     result = _ellipsoid_stage(Sensor.ACCELEROMETER, tables, wide, s.gravity_mps2, "m/s^2", logged)
-    if result.reason_code == "ellipsoid_diverged":
+    if result.reason_code == ReasonCode.ELLIPSOID_DIVERGED:
         result = _ellipsoid_stage(
             Sensor.ACCELEROMETER, tables, replace(wide, ellipsoid="li"), s.gravity_mps2, "m/s^2", logged
         )
@@ -88,7 +89,9 @@ def _ellipsoid_stage(
 ) -> StageResult:
     """Fit, judge, and write rows; a refused fit keeps its numbers."""
     if logged is None:
-        return StageResult(status="refused", reason_code=f"no_{name}", reason=f"The log has no {name} readings.")
+        return StageResult(
+            status=Status.REFUSED, reason_code=ReasonCode(f"no_{name}"), reason=f"The log has no {name} readings."
+        )
     method = s.ellipsoid
     source = logged if method == "robust" else _smoothed_or(tables, name, logged)
     try:
@@ -124,7 +127,7 @@ def _judged(
     except UnusableFlight as refusal:
         code, reason = refusal.reason_code, f"{name.capitalize()}: {refusal}"
         measured |= refusal.measured
-    status = "ok" if code is None else "refused"
+    status = Status.OK if code is None else Status.REFUSED
     rows = triad_rows(
         name,
         ELLIPSOID_METHOD[s.ellipsoid],
@@ -135,7 +138,6 @@ def _judged(
         logged_unit=s.units[name],
         reference_reading=reference_reading(s, name, logged),
         temperature_degc=mean_temperature(tables),
-        status=(status,) * 3,
         reason_code=(code,) * 3,
     )
     result = {"calibration": calibration_rows(rows), "covariance": covariance_table(fit.covariance)}
@@ -149,7 +151,7 @@ def calibrate_accelerometer_gated(tables: Tables, s: GatedAccelerometerSettings)
     Where the low-passed norm strays from g by more than 1 % rms something else than gravity was sensed: the gate
     (norm near g, slow rotation) then applies if enough of the sphere remains behind it."""
     samples = tables["samples"]
-    own = constants(tables["accelerometer"], "accelerometer") if "accelerometer" in tables else None
+    own = constants(tables["accelerometer"], Sensor.ACCELEROMETER) if "accelerometer" in tables else None
     known = own or logged_constants(s, Sensor.ACCELEROMETER)
     if known is None or samples["gyroscope_x"].null_count() or samples["accelerometer_x"].null_count():
         # Nothing to gate with: the first pass again, under the limits that count.
@@ -157,7 +159,7 @@ def calibrate_accelerometer_gated(tables: Tables, s: GatedAccelerometerSettings)
         return _ellipsoid_stage(Sensor.ACCELEROMETER, tables, s, s.gravity_mps2, "m/s^2", used)
     gyro = logged_constants(s, Sensor.GYROSCOPE)
     if gyro is None and "gyroscope" in tables:
-        gyro = constants(tables["gyroscope"], "gyroscope", refused_too=True)
+        gyro = constants(tables["gyroscope"], Sensor.GYROSCOPE, refused_too=True)
     logged, smoothed = matrix(samples, triad("accelerometer")), matrix(samples, triad("accelerometer", "smoothed_"))
     measured: dict[str, Any] = {"lever_arm_applied": s.lever_arm_m is not None and gyro is not None}
     if gyro is None:
@@ -249,15 +251,17 @@ def judge_vectors(tables: Tables, s: VectorsSettings) -> StageResult:
             continue
         fault = fatal_fault(faults, (name,))
         if fault is not None:
-            code = pl.when(pl.col("status") == "ok").then(pl.lit(fault["reason_code"])).otherwise("reason_code")
-            parts.append(tables[name].with_columns(status=pl.lit("refused"), reason_code=code))
+            code = pl.when(pl.col("status") == Status.OK).then(pl.lit(fault["reason_code"])).otherwise("reason_code")
+            parts.append(tables[name].with_columns(status=pl.lit(Status.REFUSED), reason_code=code))
         elif name == Sensor.MAGNETOMETER and motor_faults and "motor_field" in measured:
             share = float(measured["motor_field"]["share"])
             parts.append(_with_motor_field(tables[name], share, float(np.linalg.norm(s.field_ned))))
         else:
             parts.append(tables[name])
     if not parts:
-        return StageResult(status="absent", reason_code="no_vectors", reason="Neither vector triad was calibrated.")
+        return StageResult(
+            status=Status.ABSENT, reason_code=ReasonCode.NO_VECTORS, reason="Neither vector triad was calibrated."
+        )
     told = {}
     if motor_faults:
         measured["faults"] = [fault.plain() for fault in motor_faults]

@@ -28,7 +28,8 @@ from fieldcal.geometry.rotation import (
     normalise,
     slerp,
 )
-from fieldcal.names import Sensor
+from fieldcal.names import Method, Sensor, Status
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Tables, is_sound
 from fieldcal.stages.results import StageResult
@@ -46,11 +47,13 @@ SYNC_NUMBERS = ("lag_s", "lag_mid_s", "lag_sd_s", "skew_ppm", "skew_sd_ppm", "pe
 def synchronise_vps(tables: Tables, s: VpsSyncSettings) -> StageResult:
     """imu, vps, gyroscope constants, attitude → sync, vps_aligned: the VPS on the IMU's clock and in its frames."""
     if "vps" not in tables or tables["vps"].is_empty():
-        return StageResult(status="absent", reason_code="no_vps", reason="The log has no VPS.")
+        return StageResult(status=Status.ABSENT, reason_code=ReasonCode.NO_VPS, reason="The log has no VPS.")
     imu, vps = tables["imu"], tables["vps"]
     logged = matrix(imu, triad("gyroscope"))
     if np.isnan(logged).any():
-        return StageResult(status="refused", reason_code="no_gyroscope", reason="Synchronisation needs a gyroscope.")
+        return StageResult(
+            status=Status.REFUSED, reason_code=ReasonCode.NO_GYROSCOPE, reason="Synchronisation needs a gyroscope."
+        )
     gyro = _gyro_constants(tables, s)
     axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
     rate = (logged - np.median(logged, axis=0) if gyro is None else sensor_model.calibrate(logged, *gyro)) @ axes.T
@@ -81,9 +84,9 @@ def synchronise_vps(tables: Tables, s: VpsSyncSettings) -> StageResult:
         )
     except UnusableFlight as error:
         row = _sync_row(
-            {"status": "refused", "peak": error.measured.get("peak"), "runner_up": error.measured.get("runner_up")}
+            {"status": Status.REFUSED, "peak": error.measured.get("peak"), "runner_up": error.measured.get("runner_up")}
         )
-        return StageResult({"sync": row}, "refused", error.reason_code, str(error), {**measured, **error.measured})
+        return StageResult({"sync": row}, Status.REFUSED, error.reason_code, str(error), {**measured, **error.measured})
     fit, by_field = _refined(fit, tables, s, origin, t_vps, q_vps)
     measured |= by_field
     row = _sync_row(
@@ -134,11 +137,11 @@ def _sync_row(values: dict[str, Any]) -> pl.DataFrame:
 
 def _gyro_constants(tables: Tables, s: LoggedValues) -> tuple[Array, Array] | None:
     """The joint estimate's constants, else output error's, equation error's, what the logged unit says, or None."""
-    own = constants(tables["joint"], "gyroscope") if "joint" in tables else None
+    own = constants(tables["joint"], Sensor.GYROSCOPE) if "joint" in tables else None
     if own is not None:
         return own
-    for method in ("output_error", "equation_error"):
-        own = constants(tables["gyroscope"], "gyroscope", method) if "gyroscope" in tables else None
+    for method in (Method.OUTPUT_ERROR, Method.EQUATION_ERROR):
+        own = constants(tables["gyroscope"], Sensor.GYROSCOPE, method) if "gyroscope" in tables else None
         if own is not None:
             return own
     return logged_constants(s, Sensor.GYROSCOPE)

@@ -10,12 +10,13 @@ from fieldcal.config.stage_settings import WarmUpSettings
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation import warm_up
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import Sensor
+from fieldcal.names import Method, Sensor, Status
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables, is_sound
 from fieldcal.stages.results import ZERO_SLOPE, StageResult, zero_slope_rows
 from fieldcal.stages.tables import calibration_rows, constants, matrix, seconds, triad
 
-METHOD, PARAMETER = "warm_up", ZERO_SLOPE
+METHOD, PARAMETER = Method.WARM_UP, ZERO_SLOPE
 CURVE = "zero_over_temperature"
 """What stands in `measured`: the zero as a cubic of temperature, level left out, an axis a row."""
 
@@ -26,14 +27,16 @@ def find_warm_up(tables: Tables, s: WarmUpSettings) -> StageResult:
     imu, temperature = tables["imu"], tables.get("temperature")
     logged = matrix(imu, triad("gyroscope"))
     if temperature is None or (temperature := temperature.drop_nulls()).is_empty() or np.isnan(logged).any():
-        return StageResult(status="absent", reason_code="no_temperature", reason="Gyroscope or temperature is missing.")
+        return StageResult(
+            status=Status.ABSENT, reason_code=ReasonCode.NO_TEMPERATURE, reason="Gyroscope or temperature is missing."
+        )
     t = seconds(imu["t_ns"], imu["t_ns"][0])
     warm = np.interp(t, seconds(temperature["t_ns"], imu["t_ns"][0]), temperature["temperature_degc"].to_numpy())
     try:
         found = warm_up.fit_warm_up(t, logged, warm, max_gap_s=s.manoeuvre_max_gap_s)
     except UnusableFlight as error:
         return StageResult(
-            status="absent", reason_code=error.reason_code, reason=error.sentence, measured=error.measured
+            status=Status.ABSENT, reason_code=error.reason_code, reason=error.sentence, measured=error.measured
         )
     rows = _rows(Sensor.GYROSCOPE, found, s)
     resting = _resting(tables, s, t, logged, warm)
@@ -65,7 +68,7 @@ def _rows(sensor: Sensor, found: warm_up.WarmUp, s: WarmUpSettings) -> list[dict
 
 def _resting(tables: Tables, s: WarmUpSettings, t: Array, rate: Array, warm: Array) -> warm_up.WarmUp | None:
     """The accelerometer at rest; None without readings that can be trusted, constants, or such a rest."""
-    known = constants(tables["accelerometer"], "accelerometer") if "accelerometer" in tables else None
+    known = constants(tables["accelerometer"], Sensor.ACCELEROMETER) if "accelerometer" in tables else None
     if known is None or not is_sound(tables, "accelerometer"):
         return None
     scale, bias = known

@@ -11,16 +11,16 @@ from typing import Any
 import polars as pl
 
 from fieldcal.config.configuration import Alerts
+from fieldcal.names import GRAVEST_FIRST, PREFERRED_METHODS, DriftStatus, Status
 from fieldcal.schemas.reference import UNCONFIRMED_SD
 from fieldcal.trends.reasons import AGREEMENT
 from fieldcal.warehouse import Warehouse
 
 NORMAL = Alerts()
-STATUSES = ("step", "drifting", "outlier")
-KINDS = (*STATUSES, "last_flight", "recovered", "expired", "idle")
+STATUSES = GRAVEST_FIRST[:3]
+KINDS: tuple[str, ...] = (*STATUSES, "last_flight", "recovered", "expired", "idle")
 TELLING = ("zero_bias", "zero", "scale", "bias")
 """Which parameter speaks for an axis first: the best conditioned."""
-METHODS = ("joint", "output_error", "ellipsoid_robust")
 SERIES = ["imu_id", "sensor", "method", "parameter", "axis"]
 
 
@@ -73,7 +73,7 @@ def last_usable(root: Path) -> pl.DataFrame:
     return (
         Warehouse(root)
         .scan("calibration")
-        .filter((pl.col("status") == "ok") & pl.col("started_at").is_not_null())
+        .filter((pl.col("status") == Status.OK) & pl.col("started_at").is_not_null())
         .group_by("vehicle_id", "imu_id", "sensor")
         .agg(last_at=pl.col("started_at").max())
         .sort("vehicle_id", "imu_id", "sensor")
@@ -85,20 +85,21 @@ def _news(both: pl.DataFrame) -> Iterable[Change]:
     """Rows whose status became worse or well again, whose step is another, or whose last flight is newly off."""
     status, before = pl.col("status"), pl.col("status_before")
     off, off_before = (pl.col(name).abs().fill_null(0.0) > UNCONFIRMED_SD for name in ("last_z", "last_z_before"))
-    another = (status == "step") & (pl.col("change_at") != pl.col("change_at_before"))
+    another = (status == DriftStatus.STEP) & (pl.col("change_at") != pl.col("change_at_before"))
     kind = (
         pl.when(status.is_in(STATUSES) & (status.ne_missing(before) | another.fill_null(False)))
         .then(status)
-        .when((status == "stable") & off & ~off_before)
+        .when((status == DriftStatus.STABLE) & off & ~off_before)
         .then(pl.lit("last_flight"))
-        .when((status == "stable") & before.is_in(STATUSES))
+        .when((status == DriftStatus.STABLE) & before.is_in(STATUSES))
         .then(pl.lit("recovered"))
     )
+    ranked: tuple[tuple[str, tuple[str, ...]], ...] = (("parameter", TELLING), ("method", PREFERRED_METHODS))
     rank = [
         pl.col(name).replace_strict(
-            {value: i for i, value in enumerate(order)}, default=len(order), return_dtype=pl.Int64
+            {str(value): i for i, value in enumerate(order)}, default=len(order), return_dtype=pl.Int64
         )
-        for name, order in (("parameter", TELLING), ("method", METHODS))
+        for name, order in ranked
     ]
     news = both.with_columns(kind=kind).filter(pl.col("kind").is_not_null())
     groups = ["kind", "imu_id", "sensor", "axis"]

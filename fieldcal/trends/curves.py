@@ -12,6 +12,7 @@ import polars as pl
 
 from fieldcal.estimation.warm_up import SCALE_PER_DEGC_SD
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import Status
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.stages.warm_up import CURVE, METHOD, PARAMETER
 from fieldcal.trends.regression import Trends
@@ -46,7 +47,7 @@ class Bent:
 
 def bends_of(root: Path) -> Bends:
     """Every warm-up flight's curve, from the stage's own record."""
-    told = Warehouse(root).scan("run").filter((pl.col("stage") == METHOD) & (pl.col("status") == "ok"))
+    told = Warehouse(root).scan("run").filter((pl.col("stage") == METHOD) & (pl.col("status") == Status.OK))
     found: dict[tuple[str, str], Source] = {}
     for flight_id, text in told.select("flight_id", "measured").collect().iter_rows():
         curve = json.loads(text or "{}").get(CURVE)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from fieldcal.names import GRAVEST_FIRST, Status
 from fieldcal.schemas import TABLES
 from fieldcal.stages.run_key import run_key, source_digest
 from fieldcal.trends import few_sessions, regression, siblings
@@ -110,11 +111,11 @@ def history_of_everything(root: Path) -> pl.DataFrame:
     warehouse = Warehouse(root)
     lead = ["vehicle_id", "imu_id", "session_id", "flight_id", "started_at"]
     columns = [*lead, "sensor", "method", "parameter", "axis", "value", "sd", "unit", "temperature_degc"]
-    calibration = warehouse.scan("calibration").filter(pl.col("status") == "ok").select(columns)
+    calibration = warehouse.scan("calibration").filter(pl.col("status") == Status.OK).select(columns)
     warm = warehouse.scan("flight").select("vehicle_id", "flight_id", temperature_degc="temperature_mean_degc")
     text = {"sensor": pl.lit(VPS), "method": pl.lit("sync"), "axis": pl.lit("")}
     flight = ["vehicle_id", "flight_id"]
-    sync = warehouse.scan("sync").filter(pl.col("status") == "ok").join(warm, on=flight, how="left")
+    sync = warehouse.scan("sync").filter(pl.col("status") == Status.OK).join(warm, on=flight, how="left")
     clock = [
         sync.with_columns(**text, parameter=pl.lit(name), value=value, sd=sd, unit=pl.lit(unit)).select(columns)
         for name, value, sd, unit in (
@@ -260,6 +261,6 @@ def drift_rows(root: Path, vehicle: str | None, sensor: str | None, parameter: s
         if wanted is not None:
             rows = rows.filter(pl.col(column) == wanted)
     rank = pl.col("status").replace_strict(
-        {"step": 0, "drifting": 1, "outlier": 2, "stable": 3, "insufficient": 4}, default=5, return_dtype=pl.Int8
+        {str(status): place for place, status in enumerate(GRAVEST_FIRST)}, default=5, return_dtype=pl.Int8
     )
     return rows.sort([rank, *KEY]).collect()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from fieldcal.names import DriftStatus
 from fieldcal.schemas.reference import UNCONFIRMED_SD
 from fieldcal.trends.series import ENOUGH_SESSIONS
 from fieldcal.words.numbers import number, with_sd
@@ -16,20 +17,20 @@ VPS, AGREEMENT = "vps", "fit"
 def reason(row: Mapping[str, Any]) -> str | None:
     """The sentence; None for a stable row whose last flight lies where it should."""
     unit = "" if row["unit"] in (None, "1") else f" {row['unit']}"
-    if row["status"] == "insufficient":
+    if row["status"] == DriftStatus.INSUFFICIENT:
         sessions = row["n_sessions"]
         told = f"{sessions} session{'' if sessions == 1 else 's'}: a trend needs {ENOUGH_SESSIONS}."
         if row["borrowed_from"] is None:
             return told
         lent = f"scatter between sessions ({number(row['session_sd'])}{unit}) and slope are those of"
         return f"{told} The value is the sessions' mean; {lent} {row['borrowed_from']} siblings."
-    if row["status"] == "step":
+    if row["status"] == DriftStatus.STEP:
         size = with_sd(row["change_size"], row["change_size_sd"])
         return f"Stepped by {size}{unit} before the flight of {row['change_at']:%Y-%m-%d %H:%M} UTC."
-    if row["status"] == "drifting":
+    if row["status"] == DriftStatus.DRIFTING:
         slope = with_sd(row["slope_per_day"], row["slope_per_day_sd"])
         return f"Moves by {slope}{unit} a day, {_sigmas(row['slope_per_day'], row['slope_per_day_sd'])} sd from none."
-    if row["status"] == "outlier":
+    if row["status"] == DriftStatus.OUTLIER:
         what = "Its scatter between sessions" if row["sensor"] == "vps" else number(row["value_at_25degc"]) + unit
         return f"{what} is {row['fleet_z']:+.1f} sd from the fleet's other IMUs."
     if row["last_z"] is not None and abs(row["last_z"]) > UNCONFIRMED_SD:

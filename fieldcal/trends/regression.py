@@ -20,6 +20,7 @@ import numpy as np
 from scipy import stats
 
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import DriftStatus
 from fieldcal.trends.evidence import FALSE_ALARMS, MOST_STEPS, Evidence, evidence
 from fieldcal.trends.random_effects import fit_random_effects
 from fieldcal.trends.series import ENOUGH_SESSIONS, LEVEL, Histories, prepare
@@ -158,14 +159,14 @@ def statuses(trends: Trends, fleet_p: Array) -> np.ndarray:
     `fleet_p` (g,): chance of such a distance from the siblings (`trends.siblings.sibling_distance`).
     """
     enough = trends.n_sessions >= ENOUGH_SESSIONS
-    status = np.full(len(enough), "insufficient", dtype=object)
+    status = np.full(len(enough), DriftStatus.INSUFFICIENT.value, dtype=object)
     outlier = np.zeros(len(enough), dtype=bool)
     outlier[enough] = alarms(fleet_p[enough], FALSE_OUTLIERS)
     stepped, drifting = moving(trends)
-    status[enough] = "stable"
-    status[enough & outlier] = "outlier"
-    status[drifting] = "drifting"
-    status[stepped] = "step"
+    status[enough] = DriftStatus.STABLE.value
+    status[enough & outlier] = DriftStatus.OUTLIER.value
+    status[drifting] = DriftStatus.DRIFTING.value
+    status[stepped] = DriftStatus.STEP.value
     return status
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from fieldcal.names import Status, Verdict
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.words.numbers import number, with_sd
 
 QUANTITIES = {
@@ -19,7 +21,7 @@ Rows = Sequence[Mapping[str, Any]]
 def verdict_sentence(flight: Mapping[str, Any]) -> str:
     """What became of the log, in a line."""
     head = f"{flight['log_uri']} ({flight['vehicle_id']}, flight {flight['flight_id']}): {flight['verdict']}"
-    if flight["verdict"] in ("ok", "partial"):
+    if Verdict(flight["verdict"]).usable:
         rates = f"{flight['duration_s']:.1f} s, IMU at {flight['imu_rate_hz']:.0f} Hz"
         if flight["vps_rate_hz"]:
             rates += f", VPS at {flight['vps_rate_hz']:.0f} Hz"
@@ -31,7 +33,7 @@ def verdict_sentence(flight: Mapping[str, Any]) -> str:
 
 def advised(runs: Rows) -> list[str]:
     """What would make weak constants better, by the stages that found them (a refused stage says it in its reason)."""
-    return [run["measured"]["advice"] for run in runs if run["status"] == "ok" and run["measured"].get("advice")]
+    return [run["measured"]["advice"] for run in runs if run["status"] == Status.OK and run["measured"].get("advice")]
 
 
 def is_consequence(run: Mapping[str, Any]) -> bool:
@@ -42,13 +44,13 @@ def is_consequence(run: Mapping[str, Any]) -> bool:
 
     code, stage = str(run["reason_code"]), next((s for s in PIPELINE if s.name == run["stage"]), None)
     needs = () if stage is None else (need for need in stage.needs if not stage.reads[need].startswith("ingest."))
-    wanting = code in ("no_samples", "no_manoeuvre") or code in [f"no_{need}" for need in needs]
-    return bool(run["status"] == "refused" and wanting)
+    wanting = code in (ReasonCode.NO_SAMPLES, ReasonCode.NO_MANOEUVRE) or code in [f"no_{need}" for need in needs]
+    return bool(run["status"] == Status.REFUSED and wanting)
 
 
 def sync_sentence(sync: Mapping[str, Any]) -> str:
     """The clocks in a line."""
-    if sync["status"] != "ok":
+    if sync["status"] != Status.OK:
         return f"VPS clock: {sync['status']}; peak {number(sync['peak'], 3)}, next best {number(sync['runner_up'], 3)}"
     return (
         f"VPS clock: lag {sync['lag_s']:+.5f} s at the first IMU sample (VPS clock + lag = IMU clock), "

@@ -14,10 +14,7 @@ WITH latest AS (
             struct_pack(vehicle_id, method, value, sd, unit, at_degc := c.temperature_degc, flight_id, started_at),
             row(
                 coalesce(started_at, TIMESTAMPTZ '-infinity'), flight_id,
-                CASE method
-                    WHEN 'joint' THEN 5 WHEN 'output_error' THEN 4 WHEN 'ellipsoid_robust' THEN 3 WHEN 'ellipsoid' THEN 2
-                    WHEN 'equation_error' THEN 1 ELSE 0
-                END,
+                CASE method {exactness} ELSE 0 END,
                 method
             )
         ) AS l

@@ -30,6 +30,7 @@ from fieldcal.geometry.rotation import (
     slerp,
     to_rotation_vector,
 )
+from fieldcal.reason_codes import ReasonCode
 
 FINE_CUTOFF_HZ = 8.0
 REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock
@@ -234,7 +235,7 @@ def synchronise(
     t_imu, t_vps = np.asarray(t_imu, dtype=float), np.asarray(t_vps, dtype=float)
     if len(t_vps) < 50 or t_vps[-1] - t_vps[0] < 2.0 or len(t_imu) < 50:
         raise UnusableFlight(
-            "vps_too_short", "The VPS or IMU record is too short to synchronise.", {"n_vps": len(t_vps)}
+            ReasonCode.VPS_TOO_SHORT, "The VPS or IMU record is too short to synchronise.", {"n_vps": len(t_vps)}
         )
     interval = float(max(np.median(np.diff(t_imu)), 1e-3))
     imu = imu_rates(t_imu, rate_imu, interval)
@@ -244,13 +245,13 @@ def synchronise(
     measured = {"peak": peak, "runner_up": runner_up, "peak_width_s": width, "coarse_lag_s": lag}
     if peak < min_peak:
         raise UnusableFlight(
-            "flat_peak",
+            ReasonCode.FLAT_PEAK,
             f"The best correlation between IMU and VPS is {peak:.2f}, below {min_peak:.2f}: not the same motion.",
             measured,
         )
     if runner_up > 0.98 * peak:
         raise UnusableFlight(
-            "ambiguous_peak",
+            ReasonCode.AMBIGUOUS_PEAK,
             f"Two lags fit about equally well (correlations {peak:.3f} and {runner_up:.3f}): add an unrepeated motion.",
             measured,
         )
@@ -258,7 +259,7 @@ def synchronise(
     measured |= {"explained": fit.explained, "skew_ppm": fit.skew_ppm, "lag_sd_s": fit.lag_sd_s}
     if fit.explained < MIN_EXPLAINED or abs(fit.skew_ppm) > MAX_SKEW_PPM or fit.lag_sd_s > MAX_LAG_SD_S:
         raise UnusableFlight(
-            "not_the_same_motion",
+            ReasonCode.NOT_THE_SAME_MOTION,
             f"At the best lag the VPS explains {100 * fit.explained:.0f} % of the gyroscope's variance, with a clock"
             f" drift of {fit.skew_ppm:.0f} ppm and a lag known to {1e3 * fit.lag_sd_s:.2g} ms: not the same motion.",
             measured,

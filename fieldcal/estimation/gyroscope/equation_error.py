@@ -11,6 +11,7 @@ from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.robust import reweighted
 from fieldcal.estimation.statistics import huber_inflation, least_squares_covariance
 from fieldcal.geometry.rotation import Array, body_rate, rate_matrix
+from fieldcal.reason_codes import ReasonCode
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,9 @@ def fit_equation_error(
     centre = np.average(w_d, axis=0, weights=trust)
     spread = np.sqrt(np.average((w_d - centre) ** 2, axis=0, weights=trust))
     if not (spread > 0).all():
-        raise UnusableFlight("gyro_not_excited", "A gyroscope axis reads one constant value: stuck, or never turned.")
+        raise UnusableFlight(
+            ReasonCode.GYRO_NOT_EXCITED, "A gyroscope axis reads one constant value: stuck, or never turned."
+        )
     x = (w_d - centre) / spread
     share = np.zeros(3) if noise_variance is None else np.asarray(noise_variance, dtype=float) / spread**2
     share = np.minimum(share, MOST_ATTENUATION)

@@ -26,6 +26,7 @@ from fieldcal.geometry.rotation import (
     rotation_steps,
     to_rotation_vector,
 )
+from fieldcal.reason_codes import ReasonCode
 
 BLOCKS = 12  # of a stretch, to tell a random walk from stationary error
 
@@ -245,7 +246,7 @@ def fit_output_error(
                 iterations=iteration,
             )
     raise EstimationError(
-        "output_error_diverged",
+        ReasonCode.OUTPUT_ERROR_DIVERGED,
         "Output error found no minimum: the integrated gyroscope never came near the measured attitude.",
         {"iterations": iteration, "attitude_error_rms_rad": float(np.sqrt(np.mean(residual**2)))},
     )

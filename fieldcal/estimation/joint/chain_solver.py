@@ -20,6 +20,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from fieldcal.errors import EstimationError
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.geometry.rotation import Array
+from fieldcal.reason_codes import ReasonCode
 
 # Peak of the acceleration's spectral density; at a quarter and at four times this frequency a tenth of it remains.
 MOTION_HZ = 0.7
@@ -167,7 +168,7 @@ def _inverse(blocks: Array) -> Array:
         root = np.linalg.inv(np.linalg.cholesky(blocks))
     except np.linalg.LinAlgError as error:
         raise EstimationError(
-            "joint_singular", "The joint equations are singular: the readings contradict the start."
+            ReasonCode.JOINT_SINGULAR, "The joint equations are singular: the readings contradict the start."
         ) from error
     return np.asarray(root.transpose(0, 2, 1) @ root)
 

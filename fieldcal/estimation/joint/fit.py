@@ -56,6 +56,7 @@ from fieldcal.estimation.joint.variance_components import (
 )
 from fieldcal.estimation.statistics import white_noise_sigma
 from fieldcal.geometry.rotation import Array
+from fieldcal.reason_codes import ReasonCode
 
 # Largest step of an attitude and of a scale: a longer one is shortened as a whole.
 LARGEST_STEP_RAD, LARGEST_STEP_RELATIVE = 0.5, 0.3
@@ -278,13 +279,13 @@ def _no_minimum(model: Model, iterations: int) -> EstimationError:
     ]
     if still:
         return EstimationError(
-            "axis_not_turned",
+            ReasonCode.AXIS_NOT_TURNED,
             f"The joint estimate found no minimum: {', '.join(still)} read hardly more than noise. Add 60° either way"
             " about every axis.",
             {"iterations": iterations, "still": still},
         )
     return EstimationError(
-        "joint_diverged",
+        ReasonCode.JOINT_DIVERGED,
         "The joint estimate found no minimum: the readings contradict each other or the start is too far off.",
         {"iterations": iterations},
     )

@@ -25,6 +25,7 @@ from fieldcal.geometry.rotation import (
     from_rotation_vector,
     multiply,
 )
+from fieldcal.reason_codes import ReasonCode
 
 KNOT_SPACING_S = 0.08
 START_CUTOFF_HZ = 4.0
@@ -143,7 +144,7 @@ def _start_attitude(
         gyro = _gyro_from_attitude(r, continuous(_turned_to(r, both)))
     if not sensed or gyro is None:
         raise UnusableFlight(
-            "no_start",
+            ReasonCode.NO_START,
             "The joint estimate found no start: it needs a magnetometer or accelerometer with some constants, and with"
             " one of them alone a gyroscope whose unit is known.",
         )
@@ -208,5 +209,7 @@ def _gyro_from_attitude(r: Readings, q: Array) -> Constants:
     try:
         fit = fit_equation_error(q, q_dot, logged)
     except UnusableFlight as error:
-        raise UnusableFlight("no_start", f"The joint estimate found no start for the gyroscope: {error}") from error
+        raise UnusableFlight(
+            ReasonCode.NO_START, f"The joint estimate found no start for the gyroscope: {error}"
+        ) from error
     return fit.scale, fit.bias

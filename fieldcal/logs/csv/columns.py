@@ -11,6 +11,7 @@ from fieldcal.errors import UnreadableLog
 from fieldcal.logs.csv.dialect import Dialect
 from fieldcal.logs.csv.units import sensor_unit
 from fieldcal.logs.interface import LogSummary
+from fieldcal.reason_codes import ReasonCode
 
 IMU_DEFAULTS: dict[str, tuple[str, ...]] = {
     "gyroscope": ("gx", "gy", "gz"),
@@ -75,7 +76,9 @@ def declared_units(dialect: Dialect, columns: Columns, summary: LogSummary, log_
         found = {sensor_unit(sensor, dialect.names[place], row[place] if row else None) for place in positions}
         if len(found) > 1:
             listed = ", ".join(sorted(str(unit) for unit in found))
-            summary.add("unit_conflict", 1, f"{log_name}: the axes of the {sensor} are in different units ({listed}).")
+            summary.add(
+                ReasonCode.UNIT_CONFLICT, 1, f"{log_name}: the axes of the {sensor} are in different units ({listed})."
+            )
         elif (unit := found.pop()) is not None:
             units[sensor] = unit
     return units
@@ -87,11 +90,11 @@ def _position(name: str, dialect: Dialect, key: str, log_name: str) -> int:
         return places[0]
     if places:
         raise UnreadableLog(
-            "duplicate_column",
+            ReasonCode.DUPLICATE_COLUMN,
             f"{log_name} has {len(places)} columns named {name!r}: which one is meant cannot be known. Rename one.",
         )
     raise UnreadableLog(
-        "missing_column",
+        ReasonCode.MISSING_COLUMN,
         f"{log_name} has no column {name!r} ({key}); {_nearest(name, dialect.names)}. Correct {key}.",
     )
 

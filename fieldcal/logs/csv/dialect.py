@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.csv.units import is_units_row
+from fieldcal.reason_codes import ReasonCode
 
 SEPARATORS = ("\t", ";", ",")
 WHITESPACE = " "
@@ -68,13 +69,15 @@ def find_dialect(block: bytes, log_name: str, separator: str | None, decimal: st
     texts = [_text(line) for line in lines]
     body = [number for number, text in enumerate(texts) if text.strip() and not text.lstrip().startswith("#")]
     if not body:
-        raise UnreadableLog("no_rows", f"{log_name} holds no rows. Nothing was recorded.")
+        raise UnreadableLog(ReasonCode.NO_ROWS, f"{log_name} holds no rows. Nothing was recorded.")
     declared = _SEPARATOR_LINE.match(texts[body[0]].strip())
     if declared and len(body) > 1:
         separator, body = separator or declared[1], body[1:]
     place = body[0]
     if b"\0" in lines[place] or (not texts[place].replace("\t", " ").isprintable()):
-        raise UnreadableLog("not_text", f"{log_name} does not begin with a readable header line. Check what it is.")
+        raise UnreadableLog(
+            ReasonCode.NOT_TEXT, f"{log_name} does not begin with a readable header line. Check what it is."
+        )
     data = [texts[number] for number in body[1:_LINES_LOOKED_AT]]
     found = separator or _separator(texts[place], data)
     names, header, first_row = cells_of(texts[place], found), lines[place], place + 1
@@ -86,13 +89,13 @@ def find_dialect(block: bytes, log_name: str, separator: str | None, decimal: st
         names = cells_of(commented[-1].lstrip("# "), found) if commented else []
         if len(names) != len(cells_of(texts[place], found)):
             raise UnreadableLog(
-                "missing_header",
+                ReasonCode.MISSING_HEADER,
                 f"{log_name} has no header: its first line holds only numbers. Put a line with the column names first.",
             )
         header, first_row = b"", place
     if len(names) > COLUMNS_CAP:
         raise UnreadableLog(
-            "too_many_columns",
+            ReasonCode.TOO_MANY_COLUMNS,
             f"{log_name} has {len(names)} columns, {COLUMNS_CAP} at most are read. Check what it is.",
         )
     unit_row = None

@@ -21,18 +21,22 @@ from fieldcal.logs.csv.units import time_unit
 from fieldcal.logs.interface import Batch, LogSummary, logged_units, stamps_are_epoch
 from fieldcal.logs.interface import Columns as BatchColumns
 from fieldcal.names import SENSORS
+from fieldcal.reason_codes import ReasonCode
 
 VPS_COLUMNS = {"quaternion_xyzw": ("qx", "qy", "qz", "qw"), "position": ("px_m", "py_m", "pz_m")}
 POWER_COLUMNS = {"current": ("current_a",), "throttle": ("throttle",)}
 _LINES_LOOKED_AT = 50
 _LOSS_SENTENCES = {
-    "ragged_row": ("have more or fewer fields than the header and were left out", True),
-    "nul_bytes": ("contain NUL bytes and were left out", True),
-    "bad_time": ("have a time that is none and were left out", True),
-    "bad_number": ("have a cell that is no number and were left out", True),
-    "incomplete_row": ("have only part of a sensor's cells and were left out", True),
-    "header_changed": ("name the columns anew and differently; nothing behind them was read: split the file", True),
-    "repeated_header": ("repeat the header; several recordings may stand in one file", False),
+    ReasonCode.RAGGED_ROW: ("have more or fewer fields than the header and were left out", True),
+    ReasonCode.NUL_BYTES: ("contain NUL bytes and were left out", True),
+    ReasonCode.BAD_TIME: ("have a time that is none and were left out", True),
+    ReasonCode.BAD_NUMBER: ("have a cell that is no number and were left out", True),
+    ReasonCode.INCOMPLETE_ROW: ("have only part of a sensor's cells and were left out", True),
+    ReasonCode.HEADER_CHANGED: (
+        "name the columns anew and differently; nothing behind them was read: split the file",
+        True,
+    ),
+    ReasonCode.REPEATED_HEADER: ("repeat the header; several recordings may stand in one file", False),
 }
 
 
@@ -87,16 +91,16 @@ class CsvTable:
                 continue
             losses.next_block()
             frame, numbers = read_rows(block, self.dialect, line, self._wanted(), losses)
-            if number == 0 and losses.counts.get("ragged_row", 0) > len(numbers):
+            if number == 0 and losses.counts.get(ReasonCode.RAGGED_ROW, 0) > len(numbers):
                 raise UnreadableLog(
-                    "ragged_rows",
+                    ReasonCode.RAGGED_ROWS,
                     f"{self._name}: most rows have not the {self.dialect.fields} fields of the header (first at line "
-                    f"{losses.first_lines['ragged_row']}), read with separator {self.dialect.separator!r}. Correct "
-                    "csv.separator and csv.decimal, or the file.",
+                    f"{losses.first_lines[ReasonCode.RAGGED_ROW]}), read with separator {self.dialect.separator!r}. "
+                    "Correct csv.separator and csv.decimal, or the file.",
                 )
             changed = other_header(frame, self.dialect)
             if changed is not None:
-                losses.add("header_changed", numbers[changed : changed + 1])
+                losses.add(ReasonCode.HEADER_CHANGED, numbers[changed : changed + 1])
                 frame, numbers = frame[:changed], numbers[:changed]
             places = row + (numbers - line)
             yield from self._block(frame, numbers, places, losses)
@@ -127,7 +131,7 @@ class CsvTable:
     def _require_time(self, table: columns_of.Columns) -> None:
         if table.time is None and not self._csv.rate_hz:
             raise UnreadableLog(
-                "missing_time",
+                ReasonCode.MISSING_TIME,
                 f"{self._name} has no time column among {', '.join(self.dialect.names[:20])}. Name it as csv.imu.t, or "
                 "give csv.rate_hz if the rows come at a fixed rate.",
             )
@@ -181,9 +185,9 @@ class CsvTable:
             if table == "power":
                 there = np.stack([there.any(axis=0)])  # one of the two will do
             absent = ~there.any(axis=0) & ~bad
-            losses.add("bad_number", numbers[bad])
-            losses.add("incomplete_row", numbers[~there.all(axis=0) & ~absent & ~bad])
-            losses.add("bad_time", numbers[~sound & there.all(axis=0) & ~bad])
+            losses.add(ReasonCode.BAD_NUMBER, numbers[bad])
+            losses.add(ReasonCode.INCOMPLETE_ROW, numbers[~there.all(axis=0) & ~absent & ~bad])
+            losses.add(ReasonCode.BAD_TIME, numbers[~sound & there.all(axis=0) & ~bad])
             kept = sound & there.all(axis=0) & ~bad
             if not kept.any():
                 continue
@@ -221,7 +225,7 @@ class CsvTable:
             )
         if self._blocks.unterminated:
             self._summary.add(
-                "unterminated_row",
+                ReasonCode.UNTERMINATED_ROW,
                 1,
                 f"{self._name} ends inside a row: the last row has no line end, its last number may be cut, and it was "
                 "left out.",
@@ -254,7 +258,7 @@ class CsvLog:
         if not set(SENSORS) & set(values):
             listed = ", ".join(self._parts[0].dialect.names[:20])
             raise UnreadableLog(
-                "missing_sensor",
+                ReasonCode.MISSING_SENSOR,
                 f"{self._name} has no known columns of gyroscope, accelerometer or magnetometer; it has {listed}. "
                 "Name them under csv.imu in the configuration.",
             )
@@ -271,7 +275,7 @@ class CsvLog:
                 self._without_vps(error)
         if not {"imu", "magnetometer"} & self.summary.counts.keys():
             told = self.summary.findings[0].sentence if self.summary.findings else "It holds a header only."
-            raise UnreadableLog("no_rows", f"{self._name} holds not one usable row. {told}")
+            raise UnreadableLog(ReasonCode.NO_ROWS, f"{self._name} holds not one usable row. {told}")
 
     def _opened(self, path: Path, vehicle: Vehicle) -> Iterator[CsvTable]:
         if not path.is_dir():
@@ -287,4 +291,4 @@ class CsvLog:
                 self._without_vps(error)
 
     def _without_vps(self, error: UnreadableLog) -> None:
-        self.summary.add("vps_unreadable", 1, f"The VPS is not read whole: {error.sentence}", loses_data=True)
+        self.summary.add(ReasonCode.VPS_UNREADABLE, 1, f"The VPS is not read whole: {error.sentence}", loses_data=True)

@@ -12,6 +12,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from fieldcal.logs.csv.dialect import QUOTE, WHITESPACE, Dialect, is_number
+from fieldcal.reason_codes import ReasonCode
 
 MISSING_CELLS = ("", "nan", "null", "na", "n/a", "none", "-")
 _LINE_FEED, _COMMENT = 10, ord("#")
@@ -21,11 +22,11 @@ _LINE_FEED, _COMMENT = 10, ord("#")
 class Losses:
     """Rows left out: reason -> how many, and the number of the first line concerned (counted from 1)."""
 
-    counts: dict[str, int] = field(default_factory=dict)
-    first_lines: dict[str, int] = field(default_factory=dict)
-    _last_lines: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    counts: dict[ReasonCode, int] = field(default_factory=dict)
+    first_lines: dict[ReasonCode, int] = field(default_factory=dict)
+    _last_lines: dict[ReasonCode, NDArray[np.int64]] = field(default_factory=dict)
 
-    def add(self, reason: str, lines: NDArray[np.int64]) -> None:
+    def add(self, reason: ReasonCode, lines: NDArray[np.int64]) -> None:
         """Count `lines` (ascending numbers) under `reason`; a line that several tables lose counts once."""
         last = self._last_lines.get(reason)
         new = lines if last is None else np.setdiff1d(lines, last, assume_unique=True)
@@ -61,8 +62,8 @@ def read_rows(
     damaged[np.searchsorted(ends, np.flatnonzero(data == 0))] = True
     trailing = (fields == dialect.fields + 1) & (data[np.maximum(ends - 1, 0)] == ord(dialect.separator))
     ragged = (fields != dialect.fields) & ~trailing & ~silent & ~damaged
-    losses.add("nul_bytes", numbers[damaged & ~silent])
-    losses.add("ragged_row", numbers[ragged])
+    losses.add(ReasonCode.NUL_BYTES, numbers[damaged & ~silent])
+    losses.add(ReasonCode.RAGGED_ROW, numbers[ragged])
     kept = ~(silent | damaged | ragged)
     if not kept.all():
         block = data[np.repeat(kept, ends - starts + 1)].tobytes()
@@ -141,7 +142,7 @@ def _silent(
         alike = np.flatnonzero((data[starts] == dialect.header[0]) & (ends - starts == len(dialect.header)))
         repeated = [line for line in alike.tolist() if block[starts[line] : ends[line]] == dialect.header]
         silent[repeated] = True
-        losses.add("repeated_header", numbers[repeated])
+        losses.add(ReasonCode.REPEATED_HEADER, numbers[repeated])
     return silent
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from fieldcal.errors import UnreadableLog
+from fieldcal.reason_codes import ReasonCode
 
 BLOCK_BYTES = 4 << 20
 LINE_CAP_BYTES = 1 << 20
@@ -34,7 +35,9 @@ class LineBlocks:
         self.unterminated = False
         try:
             if not path.stat().st_size:
-                raise UnreadableLog("empty_file", f"{path.name} is empty. Nothing was recorded, or the copy failed.")
+                raise UnreadableLog(
+                    ReasonCode.EMPTY_FILE, f"{path.name} is empty. Nothing was recorded, or the copy failed."
+                )
             with path.open("rb") as stream:
                 self._encoding, self._skip = _encoding(stream.read(_PROBE_BYTES))
         except OSError as error:
@@ -54,7 +57,7 @@ class LineBlocks:
                     rest += b"\r" if held else b""
                     if len(rest) > LINE_CAP_BYTES:
                         raise UnreadableLog(
-                            "not_text",
+                            ReasonCode.NOT_TEXT,
                             f"{self._path.name} has a line of over {LINE_CAP_BYTES} bytes: it is no table of text. "
                             "Check what it is.",
                         )
@@ -91,4 +94,4 @@ def _encoding(probe: bytes) -> tuple[str, int]:
 
 
 def _not_readable(path: Path, error: OSError) -> UnreadableLog:
-    return UnreadableLog("not_readable", f"{path.name} cannot be read: {error}. Check disk and permissions.")
+    return UnreadableLog(ReasonCode.NOT_READABLE, f"{path.name} cannot be read: {error}. Check disk and permissions.")

@@ -52,6 +52,7 @@ from fieldcal.logs.mcap.records import (
 )
 from fieldcal.logs.mcap.report import Definitions, Tally
 from fieldcal.logs.mcap.summary import ends_whole, read_summary
+from fieldcal.reason_codes import ReasonCode
 
 TOTAL_CAP_BYTES = 512 << 20
 TOTAL_CAP_RATIO = 64
@@ -117,7 +118,7 @@ class McapFile:
             self._begin = self._next_chunk(0)
             if self._begin is None:
                 raise UnreadableLog(
-                    "not_mcap",
+                    ReasonCode.NOT_MCAP,
                     f"{self.name} does not begin like an MCAP file and holds no intact MCAP chunk. Check what it is.",
                 )
             self.tally.damaged_records.append((0, "the file does not begin with MCAP's magic bytes"))

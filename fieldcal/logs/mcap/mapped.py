@@ -6,6 +6,7 @@ import mmap
 from pathlib import Path
 
 from fieldcal.errors import UnreadableLog
+from fieldcal.reason_codes import ReasonCode
 
 
 def map_file(path: Path) -> mmap.mmap:
@@ -13,9 +14,11 @@ def map_file(path: Path) -> mmap.mmap:
     try:
         with path.open("rb") as stream:
             if not path.stat().st_size:
-                raise UnreadableLog("empty_file", f"{path.name} is empty. Nothing was recorded, or the copy failed.")
+                raise UnreadableLog(
+                    ReasonCode.EMPTY_FILE, f"{path.name} is empty. Nothing was recorded, or the copy failed."
+                )
             return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError) as error:
         raise UnreadableLog(
-            "not_readable", f"{path.name} cannot be read: {error}. Check disk and permissions."
+            ReasonCode.NOT_READABLE, f"{path.name} cannot be read: {error}. Check disk and permissions."
         ) from error

@@ -17,6 +17,7 @@ from fieldcal.logs.mcap.records import HEAD_BYTES, MESSAGE_HEAD_BYTES, gather
 from fieldcal.logs.mcap.report import Definitions, report
 from fieldcal.logs.mcap.roles import METADATA_NAME, SI_TYPES, Source, choose_sources
 from fieldcal.names import SENSORS
+from fieldcal.reason_codes import ReasonCode
 
 SI_UNITS = {"gyroscope": "rad/s", "accelerometer": "m/s^2", "magnetometer": "T"}
 CHANNELS_CAP = 4096
@@ -51,13 +52,13 @@ class McapLog:
             definitions = _collected(path)
         if not definitions.channels:
             raise UnreadableLog(
-                "no_messages",
+                ReasonCode.NO_MESSAGES,
                 f"{self._name} holds no whole chunk and no definition of any topic: it was cut or damaged before the "
                 "first messages were safe. Nothing of it can be used.",
             )
         if len(definitions.channels) > CHANNELS_CAP:
             raise UnreadableLog(
-                "too_many_channels",
+                ReasonCode.TOO_MANY_CHANNELS,
                 f"{self._name} defines {len(definitions.channels)} channels, {CHANNELS_CAP} at most are read: it is "
                 "damaged, or no flight log. Check what it is.",
             )
@@ -141,14 +142,14 @@ class McapLog:
         report(file.name, file.size, file.tally, file.definitions, file.statistics, self.summary)
         for topic, count in self._malformed.items():
             self.summary.add(
-                "malformed_message",
+                ReasonCode.MALFORMED_MESSAGE,
                 count,
                 f"{self._name}: {count} messages on {topic} do not have the layout of their schema and were left out.",
                 loses_data=True,
             )
         for topic, count in self._unstamped.items():
             self.summary.add(
-                "no_header_stamp",
+                ReasonCode.NO_HEADER_STAMP,
                 count,
                 f"{self._name}: messages on {topic} carry no stamp of their own; the time of recording is used.",
             )
@@ -157,7 +158,7 @@ class McapLog:
             self.summary.metadata |= {prefix + key: value for key, value in pairs.items()}
         if not {"imu", "magnetometer"} & self.summary.counts.keys():
             raise UnreadableLog(
-                "no_messages",
+                ReasonCode.NO_MESSAGES,
                 f"{self._name}: not one message of {', '.join(source.topic for source in self._sources)} could be read"
                 + (f" ({self.summary.findings[0].sentence})" if self.summary.findings else "."),
             )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from fieldcal.logs.interface import LogSummary
 from fieldcal.logs.mcap.records import Channel, Schema, Statistics
+from fieldcal.reason_codes import ReasonCode
 
 
 @dataclass
@@ -68,7 +69,7 @@ def report(
     if tally.damaged_chunks:
         byte, why = tally.damaged_chunks[0]
         summary.add(
-            "damaged_chunk",
+            ReasonCode.DAMAGED_CHUNK,
             len(tally.damaged_chunks),
             f"{name}: {len(tally.damaged_chunks)} damaged chunk(s), the first at byte {byte} ({why}). All intact "
             f"chunks were read. Messages lost{lost}.",
@@ -77,30 +78,30 @@ def report(
     if tally.damaged_records:
         byte, why = tally.damaged_records[0]
         summary.add(
-            "damaged_record",
+            ReasonCode.DAMAGED_RECORD,
             len(tally.damaged_records),
             f"{name}: {len(tally.damaged_records)} damaged record(s) outside chunks, the first at byte {byte} ({why}).",
             loses_data=not complete,
         )
     if tally.stopped:
-        summary.add("search_cap", 1, f"{name}: {tally.stopped}; the rest was not read.", loses_data=True)
+        summary.add(ReasonCode.SEARCH_CAP, 1, f"{name}: {tally.stopped}; the rest was not read.", loses_data=True)
     elif not tally.ended and not complete:
         summary.add(
-            "truncated",
+            ReasonCode.TRUNCATED,
             1,
             f"{name} is cut short: it has {size} bytes and no end. Everything whole before the cut was read.",
             loses_data=True,
         )
     if missing and not tally.damaged_chunks:
         summary.add(
-            "count_mismatch",
+            ReasonCode.COUNT_MISMATCH,
             sum(missing.values()),
             f"{name} holds fewer messages than it says itself. Lost{lost}.",
             loses_data=True,
         )
     if surplus:
         summary.add(
-            "count_mismatch",
+            ReasonCode.COUNT_MISMATCH,
             sum(surplus.values()),
             f"{name} holds more messages than its statistics say{_listed(surplus, topics)}.",
         )
@@ -123,22 +124,22 @@ def _report_contradictions(name: str, tally: Tally, definitions: Definitions, su
     if tally.unknown_channels:
         count = sum(tally.unknown_channels.values())
         summary.add(
-            "unknown_channel",
+            ReasonCode.UNKNOWN_CHANNEL,
             count,
             f"{name}: {count} messages belong to channels that are defined nowhere in what is left of the file.",
             loses_data=True,
         )
     if tally.duplicate_chunks:
         summary.add(
-            "duplicate_chunk",
+            ReasonCode.DUPLICATE_CHUNK,
             tally.duplicate_chunks,
             f"{name}: {tally.duplicate_chunks} chunk(s) stand in the file twice and were read once.",
         )
     if tally.summary_damage:
-        summary.add("damaged_summary", 1, f"{name}: its summary section is not used ({tally.summary_damage}).")
+        summary.add(ReasonCode.DAMAGED_SUMMARY, 1, f"{name}: its summary section is not used ({tally.summary_damage}).")
     if definitions.redefined:
         summary.add(
-            "channel_redefined",
+            ReasonCode.CHANNEL_REDEFINED,
             len(definitions.redefined),
             f"{name} defines {', '.join([*definitions.redefined][:5])} twice and differently: what its messages mean "
             "is uncertain. Record the log again, or split it where the definition changes.",
@@ -146,7 +147,7 @@ def _report_contradictions(name: str, tally: Tally, definitions: Definitions, su
         )
     if tally.unverifiable:
         summary.add(
-            "unverifiable",
+            ReasonCode.UNVERIFIABLE,
             tally.unverifiable,
             f"{name} carries no CRC for {tally.unverifiable} stretch(es) of messages: damage there would go unseen.",
         )

@@ -16,6 +16,7 @@ from fieldcal.logs.encodings.ros2_definitions import short_name
 from fieldcal.logs.interface import LogSummary
 from fieldcal.logs.mcap.records import Channel, Schema
 from fieldcal.logs.mcap.report import Definitions
+from fieldcal.reason_codes import ReasonCode
 
 RAW_IMU = "fieldcal_msgs/RawImu"
 METADATA_NAME = "fieldcal"
@@ -105,7 +106,7 @@ def choose_sources(definitions: Definitions, mapping: McapMap, summary: LogSumma
     given = {value for source in sources for value in source.values}
     if not given & {"gyroscope", "accelerometer", "magnetometer"}:
         raise UnreadableLog(
-            "missing_sensor",
+            ReasonCode.MISSING_SENSOR,
             f"{log_name} holds no gyroscope, accelerometer or magnetometer messages that are known; its topics "
             f"are {_topics(definitions)}. Name them under mcap.imu and mcap.imu_fields in the configuration.",
         )
@@ -116,7 +117,7 @@ def _configured(role: str, topic: str, fields: Mapping[str, Paths], definitions:
     channels = definitions.by_topic().get(topic)
     if not channels:
         raise UnreadableLog(
-            "missing_topic",
+            ReasonCode.MISSING_TOPIC,
             f"{log_name} has no topic {topic}, which the configuration gives as mcap.{role}; its topics are "
             f"{_topics(definitions)}. Correct mcap.{role}.",
         )
@@ -124,7 +125,7 @@ def _configured(role: str, topic: str, fields: Mapping[str, Paths], definitions:
     wants = _wants(role, type_name, fields)
     if wants is None:
         raise UnreadableLog(
-            "unsupported_schema",
+            ReasonCode.UNSUPPORTED_SCHEMA,
             f"{log_name}: topic {topic} carries {type_name}, which is not a known type for mcap.{role}"
             + (". Name its fields in mcap.imu_fields." if role == "imu" else "."),
         )
@@ -133,12 +134,14 @@ def _configured(role: str, topic: str, fields: Mapping[str, Paths], definitions:
     except MissingField as error:
         listed = ", ".join(error.available[:30])
         raise UnreadableLog(
-            "missing_field",
+            ReasonCode.MISSING_FIELD,
             f"{log_name}: {type_name} on {topic} has no field {error.path} of the needed size; it has {listed}. "
             "Correct mcap.imu_fields.",
         ) from error
     except UnsupportedSchema as error:
-        raise UnreadableLog("unsupported_schema", f"{log_name}: topic {topic} cannot be decoded. {error}.") from error
+        raise UnreadableLog(
+            ReasonCode.UNSUPPORTED_SCHEMA, f"{log_name}: topic {topic} cannot be decoded. {error}."
+        ) from error
     return Source(role, topic, type_name, decoders, tuple(wants))
 
 
@@ -158,7 +161,9 @@ def _by_type(
             decoders = _decoders(channels, definitions, wants)
         except (MissingField, UnsupportedSchema) as error:
             if type_name in order:
-                summary.add("unsupported_schema", 1, f"{log_name}: topic {topic} ({type_name}) is not read: {error}.")
+                summary.add(
+                    ReasonCode.UNSUPPORTED_SCHEMA, 1, f"{log_name}: topic {topic} ({type_name}) is not read: {error}."
+                )
             continue
         hinted = any(hint in topic.lower() for hint in _HINTS.get(role, ()))
         ranks[topic] = (order.index(type_name) if type_name in order else -1, not hinted, topic)
@@ -168,7 +173,7 @@ def _by_type(
     chosen = min(candidates, key=lambda topic: ranks[topic])
     if len(candidates) > 1:
         summary.add(
-            "ambiguous_topic",
+            ReasonCode.AMBIGUOUS_TOPIC,
             len(candidates),
             f"{log_name}: {', '.join(candidates)} could all be the {role}; {chosen} is used. Name one as mcap.{role}.",
         )
