@@ -1,0 +1,443 @@
+"""Do the tests notice? One operator, comparison or constant of a module is changed at a time, and its own tests run.
+
+    python benchmarks/mutation.py                                 # every change of every module below: hours
+    python benchmarks/mutation.py --sample 200 --seed 3           # 200 changes, drawn over all modules
+    python benchmarks/mutation.py --module logs.mcap.chunks       # one module, all changes
+    python benchmarks/mutation.py --module exports --sample 40    # a room
+
+Needs the `test` extra and a system with fork. Nothing is written to the checkout: the changed module lives in the
+memory of a forked process. First a module's own tests (`TESTS`) run unchanged, and it is noted which of them pass
+through which line; a change is then shown to the tests of its line, the quickest first, until one fails.
+
+A *survivor* is a change that no test noticed. Either the tests miss something: write one that kills it, against a truth
+that does not come from the module (a closed form, another library, the simulator), never against yesterday's output. Or
+the code does nothing there: delete it. Or the change can't be seen from outside, because both forms give the same for
+every input: add it to `EQUIVALENT` with the reason. No more than 1 in 20 may live, equivalents aside.
+
+A fast path needs tests of its own that fail when it is not taken: behind it stands a slow one that gives the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import contextlib
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import itertools
+import math
+import os
+import pickle
+import random
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PACKAGE = REPOSITORY / "fieldcal"
+TESTS_FOLDER = REPOSITORY / "tests"
+MEMORY_BYTES = 4 << 30
+LEAST_TIMEOUT_S = 20
+FLOAT_FACTOR = 1.1
+ALIVE_SHARE = 1 / 20
+
+TESTS: dict[str, Sequence[str]] = {
+    "logs.mcap": ("logs/test_mcap_*.py", "logs/test_logs_mcap*.py", "logs/test_logs_protobuf.py"),
+    "logs.csv": ("logs/test_csv_*.py", "logs/test_logs_csv*.py"),
+    "logs.encodings": ("logs/test_encodings*.py", "logs/test_logs_mcap.py", "logs/test_logs_protobuf.py"),
+    "logs.stamps": ("logs/test_stamps.py",),
+    "logs.tidy": ("logs/test_tidy*.py", "logs/test_stamps.py"),
+    "exports": ("exports/test_*.py",),
+    "geometry.earth_field": ("geometry/test_earth_field.py",),
+    "geometry.intervals": ("geometry/test_*.py",),
+    "geometry.rotation": ("geometry/test_rotation.py",),
+    "geometry.sensor_model": ("geometry/test_sensor_model.py",),
+    "estimation.clock_sync": ("estimation/test_clock_*.py",),
+    "estimation.ellipsoid": ("estimation/test_ellipsoid*.py",),
+    "estimation.faults": ("estimation/test_faults*.py",),
+    "estimation.gyroscope.equation_error": ("estimation/test_equation_error*.py",),
+    "estimation.gyroscope.output_error": ("estimation/test_output_error*.py",),
+    "estimation.gyroscope.regressor_noise": ("estimation/test_regressor_noise*.py",),
+    "estimation.motion_selection": ("estimation/test_motion_selection*.py",),
+    "estimation.motor_field": ("estimation/test_motor_field*.py",),
+    "estimation.robust": ("estimation/test_robust*.py",),
+    "estimation.segments": ("estimation/test_segments*.py",),
+    "estimation.smoothing": ("estimation/test_smoothing*.py",),
+    "estimation.statistics": ("estimation/test_statistics*.py",),
+    "estimation.theil": ("estimation/test_theil*.py",),
+    "estimation.wahba": ("estimation/test_wahba*.py",),
+    "estimation.warm_up": ("estimation/test_warm_up*.py",),
+    "estimation.joint": ("estimation/joint/test_*.py",),
+}
+"""Module, or room of modules, below fieldcal → its own tests below tests/. The longest name counts."""
+
+EQUIVALENT: dict[tuple[str, str, str], str] = {}
+"""(module, the line without its indentation, the change) → why no caller can tell the difference."""
+
+_SWAPS: dict[type[ast.AST], type[ast.AST]] = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.FloorDiv,
+    ast.Pow: ast.Mult,
+    ast.LShift: ast.RShift,
+    ast.RShift: ast.LShift,
+    ast.BitAnd: ast.BitOr,
+    ast.BitOr: ast.BitAnd,
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+    ast.And: ast.Or,
+    ast.Or: ast.And,
+}
+_NAMES = {"min": "max", "any": "all", "minimum": "maximum", "argmin": "argmax", "floor": "ceil", "nanmin": "nanmax"}
+_NAMES |= {other: name for name, other in _NAMES.items()}
+_SIGNS = {
+    ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "//", ast.Mod: "%", ast.Pow: "**",
+    ast.LShift: "<<", ast.RShift: ">>", ast.BitAnd: "&", ast.BitOr: "|", ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">",
+    ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=", ast.Is: "is", ast.IsNot: "is not", ast.In: "in", ast.NotIn: "not in",
+    ast.And: "and", ast.Or: "or", ast.Not: "not", ast.USub: "-", ast.Invert: "~",
+}  # fmt: skip
+PRELOADED = (
+    "numpy", "scipy.linalg", "scipy.optimize", "scipy.signal", "scipy.spatial.transform", "scipy.special",
+    "scipy.stats", "polars", "pyarrow.parquet", "mcap.reader", "mcap.writer", "mcap_ros2.reader", "mcap_ros2.writer",
+    "pytest", "hypothesis.strategies", "duckdb", "pydantic", "yaml", "rosbags.typesys", "cyclopts", "rich.table",
+)  # fmt: skip
+"""What many tests import; nothing of fieldcal."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """One place of a module, and what becomes of it. `number` counts the places as they are walked."""
+
+    module: str
+    number: int
+    line: int
+    last_line: int
+    at_import: bool
+    what: str
+
+
+@dataclass
+class Baseline:
+    """The unchanged module under its own tests: seconds and file of a test, and who passes through a line."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
+    through: dict[int, set[str]] = field(default_factory=dict)
+
+
+@dataclass
+class Score:
+    """What became of a module's changes."""
+
+    killed: int = 0
+    equivalent: int = 0
+    alive: list[Change] = field(default_factory=list)
+
+
+def places(tree: ast.Module) -> Iterator[tuple[ast.AST, bool, str, Callable[[], None]]]:
+    """Every node that is changed, whether it runs at import, the change in words, and a function that makes it."""
+    skipped: set[int] = set()
+    inside: set[int] = set()
+    for node in ast.walk(tree):
+        hidden: list[ast.AST | None] = []
+        if isinstance(node, ast.FunctionDef | ast.Lambda):
+            body = node.body if isinstance(node, ast.FunctionDef) else [node.body]
+            inside.update(id(n) for part in body for n in ast.walk(part))
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            hidden += node.decorator_list
+        if isinstance(node, ast.FunctionDef):
+            hidden.append(node.returns)
+        if isinstance(node, ast.arg | ast.AnnAssign):
+            hidden.append(node.annotation)
+        if isinstance(node, ast.keyword) and node.arg == "strict":
+            hidden.append(node.value)
+        skipped.update(id(n) for part in hidden if part is not None for n in ast.walk(part))
+    for node in ast.walk(tree):
+        at_import = id(node) not in inside
+        union_of_types = at_import and isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitOr)
+        if id(node) not in skipped and not union_of_types:
+            for what, make in _changes(node):
+                yield node, at_import, what, make
+
+
+def _changes(node: ast.AST) -> Iterator[tuple[str, Callable[[], None]]]:
+    match node:
+        case ast.BinOp() | ast.AugAssign() | ast.BoolOp():
+            if new := _SWAPS.get(type(node.op)):
+                yield f"{_SIGNS[type(node.op)]} → {_SIGNS[new]}", partial(setattr, node, "op", new())
+        case ast.Compare():
+            for i, old in enumerate(node.ops):
+                ops = [*node.ops[:i], _SWAPS[type(old)](), *node.ops[i + 1 :]]
+                yield f"{_SIGNS[type(old)]} → {_SIGNS[type(ops[i])]}", partial(setattr, node, "ops", ops)
+        case ast.UnaryOp():
+            twice = ast.UnaryOp(type(node.op)(), node.operand)
+            yield f"without {_SIGNS[type(node.op)]}", partial(setattr, node, "operand", twice)
+        case ast.Constant(value=bool() | int() | float() as value):
+            other = _other(value)
+            yield f"{value!r} → {other!r}", partial(setattr, node, "value", other)
+        case ast.Name(id=name) if name in _NAMES:
+            yield f"{name} → {_NAMES[name]}", partial(setattr, node, "id", _NAMES[name])
+        case ast.Attribute(attr=name) if name in _NAMES:
+            yield f"{name} → {_NAMES[name]}", partial(setattr, node, "attr", _NAMES[name])
+
+
+def _other(value: float) -> float:
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, int):
+        return value + 1
+    return value * FLOAT_FACTOR if value else 1.0
+
+
+def source_of(module: str) -> Path:
+    """The module's file; its name is given below fieldcal."""
+    path = PACKAGE.joinpath(*module.split("."))
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def changes_of(module: str) -> list[Change]:
+    """Every change of a module."""
+    found = []
+    for number, (node, at_import, what, _) in enumerate(places(ast.parse(source_of(module).read_text()))):
+        found.append(Change(module, number, node.lineno, node.end_lineno or node.lineno, at_import, what))
+    return sorted(found, key=lambda change: change.line)
+
+
+def changed(change: Change) -> ast.Module:
+    """The module's syntax tree with the change made."""
+    tree = ast.parse(source_of(change.module).read_text())
+    *_, make = next(itertools.islice(places(tree), change.number, None))
+    make()
+    return ast.fix_missing_locations(tree)
+
+
+def modules_of(names: Sequence[str]) -> list[str]:
+    """Modules below the names in `TESTS` that begin with one of `names`; all without names."""
+    found = set()
+    for room in TESTS:
+        path = PACKAGE.joinpath(*room.split("."))
+        files = path.rglob("*.py") if path.is_dir() else [path.with_suffix(".py")]
+        found |= {".".join(f.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__") for f in files}
+    return sorted(m for m in found if not names or any(f"{m}.".startswith(f"{name}.") for name in names))
+
+
+def tests_of(module: str) -> list[Path]:
+    """The module's own test files."""
+    room = max((room for room in TESTS if f"{module}.".startswith(f"{room}.")), key=len)
+    return sorted({path for pattern in TESTS[room] for path in TESTS_FOLDER.glob(pattern)})
+
+
+class _Loader(importlib.machinery.SourceFileLoader, importlib.abc.MetaPathFinder):
+    """Gives one module the code of a changed syntax tree."""
+
+    def __init__(self, change: Change) -> None:
+        super().__init__(f"fieldcal.{change.module}", str(source_of(change.module)))
+        self.tree = changed(change)
+
+    def find_spec(self, fullname: str, path: object, target: object = None) -> importlib.machinery.ModuleSpec | None:
+        return (
+            importlib.util.spec_from_file_location(fullname, self.path, loader=self) if fullname == self.name else None
+        )
+
+    def get_code(self, fullname: str) -> CodeType:
+        return compile(self.tree, self.path, "exec")
+
+
+class _Watch:
+    """Plugin of pytest: how long each test takes, and which lines of one file it passes."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = str(file)
+        self.lines: set[int] = set()
+        self.baseline = Baseline()
+
+    def __call__(self, frame: FrameType, event: str, arg: object) -> Any:
+        if frame.f_code.co_filename != self.file:
+            return None
+        return self._line(frame, event, arg)
+
+    def _line(self, frame: FrameType, event: str, arg: object) -> Any:
+        self.lines.add(frame.f_lineno)
+        return self._line
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_setup(self, item: pytest.Item) -> Iterator[None]:
+        yield from self._phase(f"{item.path}")  # what fixtures pass through stands behind every test of the file
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
+        yield from self._phase(item.nodeid)
+
+    def _phase(self, owner: str) -> Iterator[None]:
+        self.lines.clear()
+        sys.settrace(self)
+        threading.settrace(self)
+        try:
+            yield
+        finally:
+            sys.settrace(None)
+            for line in self.lines:
+                self.baseline.through.setdefault(line, set()).add(owner)
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self.baseline.seconds[report.nodeid] = self.baseline.seconds.get(report.nodeid, 0.0) + report.duration
+
+    def pytest_collection_finish(self, session: pytest.Session) -> None:
+        self.baseline.files = {item.nodeid: str(item.path) for item in session.items}
+
+
+class _Chosen:
+    """Plugin of pytest: only these tests, in this order."""
+
+    def __init__(self, tests: Sequence[str]) -> None:
+        self.order = {test: i for i, test in enumerate(tests)}
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items[:] = sorted((i for i in items if i.nodeid in self.order), key=lambda i: self.order[i.nodeid])
+
+
+def prepare() -> None:
+    """Load what many tests import, so that a forked process need not; one thread, as none lives on in it."""
+    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "POLARS_MAX_THREADS": "1"}
+    sys.dont_write_bytecode = True
+    sys.path.insert(0, str(REPOSITORY))
+    for name in PRELOADED:
+        importlib.import_module(name)
+
+
+def in_child(work: Callable[[Path], int], timeout_s: float) -> int:
+    """Run `work` in a forked process with a folder of its own; its exit code, negative when a signal ended it."""
+    folder = Path(tempfile.mkdtemp(prefix="mutation-"))
+    child = os.fork()
+    if not child:
+        code = 1
+        try:
+            os.setsid()
+            silent = os.open(os.devnull, os.O_RDWR)
+            for stream in (0, 1, 2):
+                os.dup2(silent, stream)
+            resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
+            signal.alarm(math.ceil(timeout_s))
+            code = work(folder)
+        finally:
+            os._exit(code)
+    _, status = os.waitpid(child, 0)
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(child, signal.SIGKILL)  # processes that a test left behind
+    shutil.rmtree(folder, ignore_errors=True)
+    return os.waitstatus_to_exitcode(status)
+
+
+def run_tests(files: Sequence[str], folder: Path, plugin: object, *options: str) -> int:
+    """Run pytest in this process, without traces in the checkout."""
+    quiet = ["-q", "-p", "no:cacheprovider", "-W", "ignore", f"--rootdir={REPOSITORY}", f"--basetemp={folder / 'tmp'}"]
+    return int(pytest.main([*quiet, *options, *files], plugins=[plugin]))
+
+
+def baseline_of(module: str, timeout_s: float = 1800.0) -> Baseline:
+    """The unchanged module under its own tests. Raises SystemExit when one of them fails."""
+    with tempfile.NamedTemporaryFile() as result:
+
+        def work(folder: Path) -> int:
+            watch = _Watch(source_of(module).resolve())
+            code = run_tests([str(path) for path in tests_of(module)], folder, watch)
+            Path(result.name).write_bytes(pickle.dumps(watch.baseline))
+            return code
+
+        if not tests_of(module) or (code := in_child(work, timeout_s)):
+            raise SystemExit(f"{module}: its own tests fail without any change (exit code {code}); run them by pytest.")
+        return pickle.loads(Path(result.name).read_bytes())
+
+
+def survives(change: Change, baseline: Baseline, patience_s: float) -> bool:
+    """Whether no test of the changed line fails."""
+    owners = set(baseline.seconds)
+    if not change.at_import:
+        lines = range(change.line, change.last_line + 1)
+        through = set().union(*(baseline.through.get(line, ()) for line in lines))
+        owners = {test for test in owners if test in through or baseline.files[test] in through}
+    tests = sorted((t for t in owners if baseline.seconds[t] <= patience_s), key=baseline.seconds.__getitem__)
+    if not tests:
+        return True
+    timeout_s = LEAST_TIMEOUT_S + 4 * sum(baseline.seconds[t] for t in tests)
+
+    def work(folder: Path) -> int:
+        sys.meta_path.insert(0, _Loader(change))
+        return run_tests(sorted({baseline.files[t] for t in tests}), folder, _Chosen(tests), "-x")
+
+    return in_child(work, timeout_s) == 0
+
+
+def line_of(change: Change) -> str:
+    """The changed line as it stands, without its indentation."""
+    return source_of(change.module).read_text().splitlines()[change.line - 1].strip()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--module", action="append", default=[], help="a module or a room below fieldcal; repeatable")
+    parser.add_argument("--line", type=int, help="only changes of this line of the module")
+    parser.add_argument("--sample", type=int, help="as many changes, drawn evenly from all; all without it")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--patience", type=float, default=20.0, help="tests that take longer are left out, s (20)")
+    arguments = parser.parse_args()
+
+    prepare()
+    names = modules_of(arguments.module)
+    drawn = [c for name in names for c in changes_of(name) if arguments.line in (None, c.line)]
+    if arguments.sample is not None and arguments.sample < len(drawn):
+        drawn = sorted(
+            random.Random(arguments.seed).sample(drawn, arguments.sample), key=lambda c: (c.module, c.number)
+        )
+    if not drawn:
+        raise SystemExit(f"Nothing to change in {arguments.module}; the modules are those of TESTS in this script.")
+    scores: dict[str, Score] = {}
+    for module, changes in itertools.groupby(drawn, key=lambda c: c.module):
+        score = scores[module] = Score()
+        baseline = baseline_of(module)
+        for change in changes:
+            if (module, line_of(change), change.what) in EQUIVALENT:
+                score.equivalent += 1
+            elif survives(change, baseline, arguments.patience):
+                score.alive.append(change)
+                where = source_of(module).relative_to(REPOSITORY)
+                print(f"ALIVE {where}:{change.line}: {change.what}    {line_of(change)}", flush=True)
+            else:
+                score.killed += 1
+        print(f"{module}: {score.killed} killed, {len(score.alive)} alive, {score.equivalent} equivalent", flush=True)
+
+    print(f"\n{'module':44}{'changes':>9}{'killed':>9}{'alive':>9}{'equivalent':>12}")
+    for module, score in scores.items():
+        total = score.killed + len(score.alive) + score.equivalent
+        print(f"{module:44}{total:>9}{score.killed:>9}{len(score.alive):>9}{score.equivalent:>12}")
+    killed, alive = sum(s.killed for s in scores.values()), sum(len(s.alive) for s in scores.values())
+    share = alive / max(killed + alive, 1)
+    print(f"\n{alive} of {killed + alive} live: {share:.1%}; no more than {ALIVE_SHARE:.0%} may.")
+    raise SystemExit(share > ALIVE_SHARE)
+
+
+if __name__ == "__main__":
+    main()
