@@ -11,11 +11,12 @@ from typing import Any
 import polars as pl
 
 from fieldcal.batch.reasons import NO_RESULT
-from fieldcal.batch.steps import Record
 from fieldcal.flight.job import Job
+from fieldcal.flight.record import Record
 from fieldcal.flight.rows import judged, refusals
 from fieldcal.flight.versions import versions
 from fieldcal.logs import ingest
+from fieldcal.logs.facts import Facts
 from fieldcal.names import Status, Verdict
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.pipeline import INGEST
@@ -35,7 +36,7 @@ class Outcome:
     cached: tuple[str, ...] = ()
     why: Mapping[str, str] = field(default_factory=dict)
     work_s: float = 0.0
-    facts: Mapping[str, Any] = field(init=False, compare=False)
+    facts: Facts = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "facts", judged(self.records[INGEST]["facts"], self.records))
@@ -87,7 +88,7 @@ def cause(why: Mapping[str, str | None]) -> str:
 
 def failed_outcome(job: Job, records: Mapping[str, Record], step: str, reason: str) -> Outcome:
     """Of a flight that something unforeseen stopped at `step`."""
-    record = {
+    record: Record = {
         "status": Status.FAILED,
         "reason_code": ReasonCode.STAGE_FAILED,
         "reason": reason,
@@ -97,7 +98,7 @@ def failed_outcome(job: Job, records: Mapping[str, Record], step: str, reason: s
         "outputs": {},
     }
     if INGEST not in records:
-        record |= {"facts": ingest.rejected(ReasonCode.INGEST_FAILED, reason), "signals": {}}
+        record["facts"], record["signals"] = ingest.rejected(ReasonCode.INGEST_FAILED, reason), {}
         step = INGEST
     return Outcome(job, {**records, step: record}, ran=(step,))
 

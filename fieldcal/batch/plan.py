@@ -8,9 +8,10 @@ from typing import Any
 
 from fieldcal.batch.jobs import find_jobs, without_copies
 from fieldcal.batch.log_ledger import read_ledger
-from fieldcal.batch.steps import FlightWork, Record
+from fieldcal.batch.steps import FlightWork
 from fieldcal.config.configuration import Configuration
 from fieldcal.flight.job import Job
+from fieldcal.flight.record import Record
 from fieldcal.warehouse import Warehouse
 
 

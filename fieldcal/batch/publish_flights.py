@@ -8,9 +8,9 @@ from typing import Any
 
 import polars as pl
 
-from fieldcal.batch.steps import Record
 from fieldcal.config.configuration import Configuration
 from fieldcal.flight.job import Job
+from fieldcal.flight.record import Record
 from fieldcal.flight.rows import StageTables, flight_row, judged, lead, published_tables, rows_frame, run_rows
 from fieldcal.stages.pipeline import INGEST, PUBLISHED
 from fieldcal.warehouse.publish import publish, read_history
@@ -87,11 +87,9 @@ def _counted(new: pl.DataFrame, held: pl.DataFrame, columns: list[str]) -> pl.Da
 
 
 def _row_count(records: Mapping[str, Record], sources: Sequence[str]) -> int:
-    return sum(
-        records[step]["outputs"].get(table, {}).get("rows", 0)
-        for step, table in (source.split(".") for source in sources)
-        if step in records
-    )
+    places = (source.split(".") for source in sources)
+    outputs = [records[step]["outputs"].get(table) for step, table in places if step in records]
+    return sum(output["rows"] for output in outputs if output is not None)
 
 
 def _tables(root: Path, job: Job, records: Mapping[str, Record]) -> StageTables:
@@ -101,6 +99,6 @@ def _tables(root: Path, job: Job, records: Mapping[str, Record]) -> StageTables:
     for source in (name for sources in PUBLISHED.values() for name in sources):
         step, table = source.split(".")
         if step in records and table in records[step]["outputs"]:
-            run_key = records[step]["run_key"]
+            run_key = str(records[step]["run_key"])
             tables[source] = (store.load(step, job.flight_id, run_key, [table])[table], run_key)
     return tables

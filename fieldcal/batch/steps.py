@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import polars as pl
 
@@ -21,8 +21,10 @@ from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.config.stage_settings import as_json, taken_from
 from fieldcal.errors import UnreadableLog, unforeseen
 from fieldcal.flight.job import Job, file_stamp
+from fieldcal.flight.record import Causes, Output, Record
 from fieldcal.flight.versions import versions
 from fieldcal.logs import ingest
+from fieldcal.logs.facts import Facts
 from fieldcal.logs.tidy import Disordered
 from fieldcal.names import Status, Verdict
 from fieldcal.reason_codes import ReasonCode
@@ -38,7 +40,6 @@ from fieldcal.warehouse.store import TableWriter
 
 STEPS = (INGEST, *(stage.name for stage in PIPELINE))
 STAGES: dict[str, Stage] = {stage.name: stage for stage in PIPELINE}
-Record = dict[str, Any]
 
 
 class FlightWork:
@@ -87,7 +88,8 @@ class FlightWork:
 
     def find(self, step: str) -> Record | None:
         """The record of a step whose result is there and whole, taken as the step's; else None, and `why` says why."""
-        record = self._store.complete(step, self.job.flight_id, self.key(step))
+        stored = self._store.complete(step, self.job.flight_id, self.key(step))
+        record = None if stored is None else _of_store(stored)
         if record is None or (step == INGEST and not self._signals_whole(record)):
             former = self._store.latest(step, self.job.flight_id)
             self.why[step] = NO_RESULT if former is None else why_it_runs(former, self._causes(step))
@@ -149,7 +151,7 @@ class FlightWork:
         sources = sorted(set(STAGES[step].reads.values()))
         return {name: self._inputs[name] for name in sources if name in self._inputs}
 
-    def _causes(self, step: str) -> Record:
+    def _causes(self, step: str) -> Causes:
         """What the key of a step is made of, as its record keeps it."""
         return {
             "run_key": self.key(step),
@@ -180,7 +182,7 @@ class FlightWork:
             return self._ingest_record(ingest.rejected(ReasonCode.CHANGED_WHILE_READ, why), {}, key, keep=False)
         return self._ingest_record(facts, signals, key, keep=facts["reason_code"] != ingest.TOO_SLOW)
 
-    def _write_signals(self, *, whole: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _write_signals(self, *, whole: bool) -> tuple[Facts, dict[str, Output]]:
         """Stream the log into the signal tables; nothing appears unless the whole log came through."""
         writers: dict[str, TableWriter] = {}
         try:
@@ -204,17 +206,13 @@ class FlightWork:
     def _writer(self, table: str, units: Mapping[str, str]) -> TableWriter:
         return signal_writer(self._root, table, self.job.vehicle_id, self.job.flight_id, units=units)
 
-    def _ingest_record(self, facts: Mapping[str, Any], signals: Mapping[str, Any], key: str, *, keep: bool) -> Record:
+    def _ingest_record(self, facts: Facts, signals: dict[str, Output], key: str, *, keep: bool) -> Record:
         status = Status.OK if Verdict(facts["verdict"]).usable else Status.REFUSED
-        record = {
-            "status": Status.FAILED if facts["reason_code"] == ReasonCode.INGEST_FAILED else status,
-            "reason_code": facts["reason_code"],
-            "reason": facts["reason"],
-            "measured": plain({"rows": facts["rows"], "units": facts["units"], "verdict": facts["verdict"]}),
-            **self._causes(INGEST),
-            "facts": plain(facts),
-            "signals": dict(signals),
-        }
+        if facts["reason_code"] == ReasonCode.INGEST_FAILED:
+            status = Status.FAILED
+        measured = {"rows": facts["rows"], "units": facts["units"], "verdict": facts["verdict"]}
+        record = _record(status, facts["reason_code"], facts["reason"], measured, self._causes(INGEST))
+        record["facts"], record["signals"] = plain(facts), signals
         return self._kept(INGEST, key, {}, record) if keep else _unkept(record, key)
 
     def _signals_whole(self, record: Record) -> bool:
@@ -233,13 +231,8 @@ class FlightWork:
         except Exception as error:
             why = f"{stage.name}: {unforeseen(self.job.log_uri, error)}"
             result = StageResult(status=Status.FAILED, reason_code=ReasonCode.STAGE_FAILED, reason=why)
-        record = {
-            "status": result.status,
-            "reason_code": result.reason_code,
-            "reason": result.reason,
-            "measured": plain(result.measured),
-            **self._causes(stage.name),
-        }
+        causes = self._causes(stage.name)
+        record = _record(result.status, result.reason_code, result.reason, result.measured, causes)
         if result.status == Status.FAILED:
             return _unkept(record, key)
         self._tables |= {f"{stage.name}.{name}": frame for name, frame in result.tables.items()}
@@ -251,18 +244,40 @@ class FlightWork:
             if step == INGEST:
                 self._tables[name] = read_signal(self._root, table, self.job.vehicle_id, self.job.flight_id)
             else:
-                loaded = self._store.load(step, self.job.flight_id, self.records[step]["run_key"], [table])
+                loaded = self._store.load(step, self.job.flight_id, str(self.records[step]["run_key"]), [table])
                 self._tables[name] = loaded[table]
         return self._tables[name]
 
     def _kept(self, step: str, key: str, tables: Mapping[str, pl.DataFrame], record: Record) -> Record:
-        return self._store.save(step, self.job.flight_id, key, tables, record)
+        return _of_store(self._store.save(step, self.job.flight_id, key, tables, record))
 
 
 class _Quarantined(Exception):
-    def __init__(self, facts: dict[str, Any]) -> None:
+    def __init__(self, facts: Facts) -> None:
         super().__init__(facts["reason"])
         self.facts = facts
+
+
+def _record(
+    status: Status, reason_code: str | None, reason: str | None, measured: Mapping[str, object], causes: Causes
+) -> Record:
+    """The record of a step that has ended, without what it wrote."""
+    return {
+        "status": status,
+        "reason_code": reason_code,
+        "reason": reason,
+        "measured": plain(measured),
+        "run_key": causes["run_key"],
+        "params": causes["params"],
+        "inputs": causes["inputs"],
+        "source": causes["source"],
+        "versions": causes["versions"],
+    }
+
+
+def _of_store(stored: dict[str, Any]) -> Record:
+    """A record as the warehouse gives it back: what was handed to it, with the outputs."""
+    return cast(Record, stored)
 
 
 def _unkept(record: Record, key: str) -> Record:

@@ -13,10 +13,12 @@ from fieldcal.config.find import CONFIG_NAME, configuration_of, find_source, wit
 from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.errors import FieldcalError, unforeseen
 from fieldcal.flight.job import Job
+from fieldcal.flight.record import StepRecord
 from fieldcal.flight.rows import flight_row, judged, lead, published_tables, rows_frame, run_rows
 from fieldcal.flight.threads import one_thread
 from fieldcal.flight.versions import versions
 from fieldcal.logs import flight_id, ingest, log_format, log_sha256
+from fieldcal.logs.facts import Facts
 from fieldcal.names import SENSORS, Approach, Status, Verdict
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.pipeline import INGEST, PIPELINE, run_stage
@@ -71,7 +73,7 @@ def run_log(
     if method is not None:
         vehicle = vehicle.model_copy(update={"method": dict.fromkeys(SENSORS, Approach(method))})
     signals, facts = ingest.read_flight(log, vehicle)
-    records: dict[str, dict[str, Any]] = {INGEST: _record(_ingest_result(facts))}
+    records: dict[str, StepRecord] = {INGEST: _record(_ingest_result(facts))}
     settings: FlightSettings | None = None
     tables: dict[str, pl.DataFrame] = {f"{INGEST}.{name}": frame for name, frame in signals.items()}
     if Verdict(facts["verdict"]).usable:
@@ -116,13 +118,14 @@ def _job(log: Path, vehicle_id: str, session_id: str, archive: Path) -> Job:
     return Job(str(log), log.relative_to(archive).as_posix(), vehicle_id, session_id, kind, sha256, flight_id(sha256))
 
 
-def _ingest_result(facts: dict[str, Any]) -> StageResult:
+def _ingest_result(facts: Facts) -> StageResult:
     status = Status.OK if Verdict(facts["verdict"]).usable else Status.REFUSED
     measured = {"rows": facts["rows"], "units": facts["units"], "verdict": facts["verdict"]}
-    return StageResult(status=status, reason_code=facts["reason_code"], reason=facts["reason"], measured=measured)
+    code = None if facts["reason_code"] is None else ReasonCode(facts["reason_code"])
+    return StageResult(status=status, reason_code=code, reason=facts["reason"], measured=measured)
 
 
-def _record(result: StageResult) -> dict[str, Any]:
+def _record(result: StageResult) -> StepRecord:
     return {
         "status": result.status,
         "reason_code": result.reason_code,

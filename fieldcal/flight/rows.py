@@ -11,7 +11,9 @@ import polars as pl
 
 from fieldcal import schemas
 from fieldcal.flight.job import Job
+from fieldcal.flight.record import StepRecord
 from fieldcal.logs import ingest
+from fieldcal.logs.facts import Facts, FindingFacts
 from fieldcal.names import Status, Verdict
 from fieldcal.stages.pipeline import PUBLISHED
 from fieldcal.warehouse.store import empty_frame, frame
@@ -43,7 +45,7 @@ StageTables = Mapping[str, tuple[pl.DataFrame, str | None]]
 """`stage.table` → its rows and the run_key that made them."""
 
 
-def lead(job: Job, imu_id: str, facts: Mapping[str, Any]) -> dict[str, Any]:
+def lead(job: Job, imu_id: str, facts: Facts) -> dict[str, Any]:
     """What leads every row of the history."""
     return {
         "flight_id": job.flight_id,
@@ -54,19 +56,20 @@ def lead(job: Job, imu_id: str, facts: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def flight_row(job: Job, leading: Mapping[str, Any], facts: Mapping[str, Any]) -> dict[str, Any]:
+def flight_row(job: Job, leading: Mapping[str, Any], facts: Facts) -> dict[str, Any]:
     """The row of `flight`."""
+    known: Mapping[str, object] = facts
     return {
         **leading,
         "log_uri": job.log_uri,
         "log_sha256": job.sha256,
         "log_format": job.log_format,
-        **{name: facts[name] for name in FACTS},
+        **{name: known[name] for name in FACTS},
         "findings": _json(facts["findings"]),
     }
 
 
-def run_rows(leading: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+def run_rows(leading: Mapping[str, Any], records: Mapping[str, StepRecord]) -> list[dict[str, Any]]:
     """Rows of `run`, one a step. The sentence of a refusal stands among the measured numbers, as `reason`."""
     return [
         {
@@ -82,10 +85,10 @@ def run_rows(leading: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]
     ]
 
 
-def judged(facts: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def judged(facts: Facts, records: Mapping[str, StepRecord]) -> Facts:
     """The facts with what the stages found: a stage that failed makes an `ok` log `partial`, faults are findings."""
     faults = [fault for record in records.values() for fault in record["measured"].get("faults", [])]
-    told = [{"code": fault["code"], "count": 1, "sentence": fault["sentence"]} for fault in faults]
+    told: list[FindingFacts] = [{"code": fault["code"], "count": 1, "sentence": fault["sentence"]} for fault in faults]
     facts = {**facts, "findings": [*facts["findings"], *told]}
     failed = [record for record in records.values() if record["status"] == Status.FAILED]
     if facts["verdict"] == Verdict.OK and failed:
@@ -98,7 +101,7 @@ def judged(facts: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -
     return facts
 
 
-def refusals(records: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+def refusals(records: Mapping[str, StepRecord]) -> list[dict[str, Any]]:
     """Stages that refused or failed, with code and sentence."""
     return [
         {"stage": step, "status": record["status"], "reason_code": record["reason_code"], "reason": record["reason"]}

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -20,6 +19,7 @@ from fieldcal.config.flight_settings import FlightSettings, flight_settings
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs import Finding, LogReader, LogSummary, open_log
 from fieldcal.logs.discovery import folder_parts
+from fieldcal.logs.facts import Declared, Facts, FindingFacts, Judged
 from fieldcal.logs.interface import EPOCH_KNOWN_AFTER_NS
 from fieldcal.logs.tidy import HELD_ROWS, Disordered, TidySignal
 from fieldcal.names import Verdict
@@ -116,7 +116,7 @@ class TidyLog:
         own = [finding for signal in self._signals.values() for finding in signal.findings(self._name)]
         return [*self._reader.summary.findings, *own]
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         """What is known of the flight, plain JSON; unknown numbers are None."""
         summary, findings = self._reader.summary, self._findings()
         imu = self._signals["imu"]
@@ -155,7 +155,7 @@ def logged_units(path: Path, vehicle: Vehicle) -> dict[str, str]:
     return dict(reader.summary.units)
 
 
-def declared(summary: LogSummary) -> dict[str, Any]:
+def declared(summary: LogSummary) -> Declared:
     """What the log says of itself."""
     return {
         "units": dict(summary.units),
@@ -166,9 +166,9 @@ def declared(summary: LogSummary) -> dict[str, Any]:
     }
 
 
-def verdict(findings: list[Finding]) -> dict[str, Any]:
+def verdict(findings: list[Finding]) -> Judged:
     """Findings as plain JSON, and the verdict they add up to with the gravest one's code and sentence."""
-    listed = [{"code": f.code, "count": f.count, "sentence": f.sentence} for f in findings]
+    listed: list[FindingFacts] = [{"code": f.code, "count": f.count, "sentence": f.sentence} for f in findings]
     for name, grave in (
         (Verdict.QUARANTINED, [f for f in findings if f.fatal]),
         (Verdict.PARTIAL, [f for f in findings if f.loses_data]),
@@ -178,12 +178,18 @@ def verdict(findings: list[Finding]) -> dict[str, Any]:
     return {"verdict": Verdict.OK, "reason_code": None, "reason": None, "findings": listed}
 
 
-def rejected(reason_code: ReasonCode, reason: str) -> dict[str, Any]:
+def rejected(reason_code: ReasonCode, reason: str) -> Facts:
     """Facts of a log in which nothing is usable."""
-    unknown = ("duration_s", "imu_rate_hz", "vps_rate_hz", "n_samples", "started_at_ns", "position")
-    temperatures = ("temperature_min_degc", "temperature_mean_degc", "temperature_max_degc")
     return {
-        **dict.fromkeys((*unknown, *temperatures)),
+        "duration_s": None,
+        "imu_rate_hz": None,
+        "vps_rate_hz": None,
+        "n_samples": None,
+        "temperature_min_degc": None,
+        "temperature_mean_degc": None,
+        "temperature_max_degc": None,
+        "started_at_ns": None,
+        "position": None,
         **declared(LogSummary("")),
         "rows": {},
         "verdict": Verdict.REJECTED,
@@ -193,7 +199,7 @@ def rejected(reason_code: ReasonCode, reason: str) -> dict[str, Any]:
     }
 
 
-def read_flight(path: Path, vehicle: Vehicle) -> tuple[dict[str, pl.DataFrame], dict[str, Any]]:
+def read_flight(path: Path, vehicle: Vehicle) -> tuple[dict[str, pl.DataFrame], Facts]:
     """A whole log in memory: signal table → tidy frame, and the facts. Unreadable: `rejected`, no tables."""
     for whole in (False, True):
         frames: dict[str, list[pl.DataFrame]] = {}
@@ -209,13 +215,13 @@ def read_flight(path: Path, vehicle: Vehicle) -> tuple[dict[str, pl.DataFrame], 
     raise AssertionError("a log that is held whole cannot be disordered")
 
 
-def started_at(facts: Mapping[str, Any]) -> datetime | None:
+def started_at(facts: Facts) -> datetime | None:
     """Time of the first IMU sample, UTC, to the microsecond; None when the log's clock has no known epoch."""
     stamp = facts["started_at_ns"]
     return None if stamp is None else EPOCH + timedelta(microseconds=stamp // 1000)
 
 
-def settings_of(facts: Mapping[str, Any], vehicle: Vehicle) -> FlightSettings:
+def settings_of(facts: Facts, vehicle: Vehicle) -> FlightSettings:
     """Settings of the stages for this flight (`config.flight_settings.flight_settings`)."""
     place = facts["position"]
     return flight_settings(

@@ -1,0 +1,52 @@
+"""What a step leaves behind beside its tables: plain JSON, from which the history's row of the step is made."""
+
+from __future__ import annotations
+
+from typing import Any, NotRequired, TypedDict
+
+from fieldcal.logs.facts import Facts
+
+
+class Output(TypedDict):
+    """A table that a step wrote. `file` and `bytes` of a stage's; a signal table lies elsewhere."""
+
+    sha256: str
+    rows: int
+    file: NotRequired[str]
+    bytes: NotRequired[int]
+
+
+class Causes(TypedDict):
+    """What the key of a step is made of."""
+
+    run_key: str
+    params: dict[str, Any]
+    inputs: dict[str, str]
+    source: str
+    versions: dict[str, str]
+
+
+class StepRecord(TypedDict):
+    """How a step ended: a `Status`, code and sentence where it is not "ok", and the numbers that decided it."""
+
+    status: str
+    reason_code: str | None
+    reason: str | None
+    measured: dict[str, Any]
+    versions: dict[str, str]
+    run_key: str | None
+
+
+class Record(StepRecord, total=False):
+    """The same of a step of a night, with what its key is made of and the sha256 of all it wrote.
+
+    `facts` and `signals` are of the step that reads the log. `unkept`: the next night tries again.
+    """
+
+    params: dict[str, Any]
+    inputs: dict[str, str]
+    source: str
+    outputs: dict[str, Output]
+    facts: Facts
+    signals: dict[str, Output]
+    unkept: bool
