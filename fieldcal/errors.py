@@ -50,6 +50,10 @@ class EstimationError(FieldcalError):
     """Enough information, yet the estimator reached no minimum."""
 
 
+class Refused(FieldcalError):
+    """A value was asked for that fieldcal refused; the sentence says why."""
+
+
 def unforeseen(log_uri: str, error: Exception) -> str:
     """What an unforeseen error says to people."""
     told = " ".join(str(error).split())
