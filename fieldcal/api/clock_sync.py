@@ -62,7 +62,7 @@ class Synchronisation(SyncFit):
 
         centred = self.rate - np.median(self.rate, axis=0)
         title = f"VPS clock: lag {1e3 * self.lag_mid_s:.3f} ± {1e3 * self.lag_sd_s:.2g} ms at mid-record"
-        return plot_clock((self.t, centred), (self.t_vps, self.vps_rate), title, unit="unit of the rates given")
+        return plot_clock((self.t, centred), (self.t_vps, self.vps_rate), title, unit="as given")
 
 
 def synchronise(

@@ -39,6 +39,8 @@ class OutputErrorFit(GyroFit):
         Rotation from the integrated to the measured attitude, rad, inertial axes.
     rate : (n, 3) array
         Calibrated rates, rad/s.
+    stretch : (n,) array
+        Numbers of the stretches that were integrated from one initial attitude.
 
     Examples
     --------
@@ -52,6 +54,7 @@ class OutputErrorFit(GyroFit):
     t: Array = field(repr=False)
     attitude_error: Array = field(repr=False)
     rate: Array = field(repr=False)
+    stretch: Array = field(repr=False)
 
     @property
     def scale_sd(self) -> Array:
@@ -72,7 +75,7 @@ class OutputErrorFit(GyroFit):
         from fieldcal.plots.attitude import plot_attitude_error
 
         title = f"Output error, {np.degrees(self.residual_rms):.2g}° rms"
-        return plot_attitude_error(self.t, self.rate, self.attitude_error, title)
+        return plot_attitude_error(self.t, self.rate, self.attitude_error, self.stretch, title)
 
 
 def fit_output_error(
@@ -150,6 +153,8 @@ def fit_output_error(
     own = np.zeros(len(t), dtype=np.int64) if segment is None else np.asarray(segment)
     if q.shape != (len(t), 4) or logged.shape != (len(t), 3) or len(own) != len(t):
         raise ValueError(f"(n,), (n, 4), (n, 3) wanted, got {t.shape}, {q.shape}, {logged.shape}")
+    if not (np.ptp(logged, axis=0) > 0.0).all():  # its scale would be anything, and its sd nothing
+        raise UnusableFlight("gyro_not_excited", "A gyroscope axis reads one constant value: stuck, or never turned.")
     begin = gyro_from_attitude(t, own, logged, q) if start is None else start
     fit = output_error.fit_output_error(
         t,
@@ -174,4 +179,4 @@ def fit_output_error(
     trust = np.ones(len(t)) if weights is None else np.asarray(weights, dtype=float)
     stretch = output_error.shooting_segments(t, own, stretch_s)
     error, _ = output_error.attitude_error(t, q, rate, stretch, trust, fixed=initial_attitude == "fixed")
-    return OutputErrorFit(**vars(fit), t=t, attitude_error=error, rate=rate)
+    return OutputErrorFit(**vars(fit), t=t, attitude_error=error, rate=rate, stretch=stretch)

@@ -46,9 +46,17 @@ def plot_history(rows: pl.DataFrame, title: str) -> list[Axes]:
     identity = "imu_id" if "imu_id" in rows.columns else "method"
     shown = rows[identity].unique(maintain_order=True).to_list()
     for axis, name in zip(axes, names, strict=True):
+        here = rows.filter(pl.col("axis") == name)
         for number, own in enumerate(shown[:MOST_CURVES]):
-            part = rows.filter(pl.col("axis") == name, pl.col(identity) == own)
-            _points(axis, part, COLOURS[number], str(own))
+            part = here.filter(pl.col(identity) == own, pl.col("status") == "ok", pl.col("value").is_not_null())
+            style: dict[str, Any] = {"fmt": "o", "ms": 4, "lw": 1.0, "capsize": 2, "color": COLOURS[number]}
+            sd = part["sd"].fill_null(0.0).to_numpy()
+            axis.errorbar(_x(part, rows), part["value"].to_numpy(), sd, label=str(own), **style)
+        limits = axis.get_ylim()
+        refused = here.filter(pl.col("status") != "ok", pl.col("value").is_not_null())
+        axis.plot(_x(refused, rows), refused["value"].to_numpy(), "x", ms=5, color=REFUSED)
+        if (here["status"] == "ok").any():  # a refused value may be far off: it does not set the limits
+            axis.set_ylim(limits)
         axis.set_ylabel(f"{name} ({unit(rows['unit'][0])})")
     _when(axes[-1], rows)
     if len(shown) > 1:
@@ -98,7 +106,7 @@ def plot_agreement(rows: pl.DataFrame) -> list[Axes]:
     axes[1].set_xscale("log")
     axes[1].barh(at, [r["rms"] for r in lines], color=COLOURS[1], height=0.6)
     for i, row in enumerate(lines):
-        axes[1].text(row["rms"], i, f" {row['rms']:.3g} {row['rms_unit']}", va="center", fontsize="x-small")
+        axes[1].text(row["rms"], i, f" {row['rms']:.3g} {unit(row['rms_unit'])}", va="center", fontsize="x-small")
     axes[1].margins(x=0.25)
     return listed(axes)
 
@@ -109,7 +117,7 @@ def _agreement_over_flights(rows: pl.DataFrame) -> list[Axes]:
     axes = panels(2, title="Agreement over the flights, smoothed readings", height_in=6.0, sharex=True)[:, 0]
     for number, (quantity, method, reference) in enumerate(keys[:MOST_CURVES]):
         own = smoothed.filter(quantity=quantity, method=method, reference=reference)
-        style: dict[str, Any] = {"marker": "o", "ms": 3, "lw": 0.9, "color": COLOURS[number]}
+        style: dict[str, Any] = {"marker": "o", "ms": 3.5, "ls": "none", "color": COLOURS[number]}
         label = f"{plain_name(quantity)}, {plain_name(method)} / {plain_name(reference)}"
         axes[0].plot(_x(own, rows), own["tic"].to_numpy(), label=label, **style)
         if own["rms_unit"][0] == "deg":
@@ -157,19 +165,6 @@ def _chosen(frame: pl.DataFrame, sensor: str | None, parameter: str | None) -> t
     if "started_at" in own.columns:
         own = own.sort("started_at", nulls_last=True, maintain_order=True)
     return own, f"{sensor}: {parameter}, {plain_name(method)}"
-
-
-def _points(axis: Axes, rows: pl.DataFrame, colour: str, label: str) -> None:
-    """Values ±1 sd; refused ones are crosses, and do not set the panel's limits."""
-    used = rows.filter(pl.col("status") == "ok", pl.col("value").is_not_null())
-    refused = rows.filter(pl.col("status") != "ok", pl.col("value").is_not_null())
-    sd = used["sd"].fill_null(0.0).to_numpy()
-    style: dict[str, Any] = {"fmt": "o", "ms": 4, "lw": 1.0, "capsize": 2, "color": colour, "label": label}
-    axis.errorbar(_x(used, rows), used["value"].to_numpy(), sd, **style)
-    limits = axis.get_ylim()
-    axis.plot(_x(refused, rows), refused["value"].to_numpy(), "x", ms=5, color=REFUSED)
-    if not used.is_empty():
-        axis.set_ylim(limits)
 
 
 def _trend_in_time(axis: Axes, row: dict[str, Any], colour: str, label: str) -> None:

@@ -36,7 +36,7 @@ def panels(
     for axis in axes.flat:
         axis.grid(True, alpha=0.3, linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.ticklabel_format(axis="y", useOffset=False)
+        axis.ticklabel_format(axis="y", useOffset=False, scilimits=(-3, 5))
     return axes
 
 
@@ -74,4 +74,4 @@ def listed(axes: Any) -> list[Axes]:
 
 def unit(text: str) -> str:
     """A unit as people write it."""
-    return {"degC": "°C", "1": "–", "": "–"}.get(text, text.replace("^2", "²"))
+    return {"degC": "°C", "deg": "°", "1": "–", "": "–"}.get(text, text.replace("^2", "²"))
