@@ -32,6 +32,150 @@ Arrays
 Symbols
     λ, Λ scale · b bias · h field · a acceleration · ω rate · q, ε, δ attitude · f field strength · σ standard
     deviation · ν residual · r_SB lever arm, centre of mass to sensor, body axes · TIC Theil inequality coefficient.
+
+Use
+    read_log → Recording; calibrate → Calibration, whose sensors have scale, bias and zero; export and apply take it on.
+    Warehouse asks what the nights have found. fit_ellipsoid, fit_output_error, fit_joint and synchronise work on
+    arrays. What was refused raises Refused when it is asked for; every error is a FieldcalError with a reason_code, or
+    Python's ValueError for a caller's mistake. plot, and the method of that name, draw any result.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from fieldcal.api.calibration import Calibration, calibrate
+    from fieldcal.api.clock_sync import Synchronisation, synchronise
+    from fieldcal.api.constants import apply, export
+    from fieldcal.api.ellipsoid import EllipsoidFit, fit_ellipsoid
+    from fieldcal.api.estimate import Estimate
+    from fieldcal.api.joint import JointEstimate, fit_joint
+    from fieldcal.api.output_error import OutputErrorFit, fit_output_error
+    from fieldcal.api.plot import plot
+    from fieldcal.api.recording import Recording, read_log
+    from fieldcal.api.sensor import SensorCalibration
+    from fieldcal.api.vps_clock import VpsClock
+    from fieldcal.api.warehouse import Warehouse
+    from fieldcal.errors import (
+        ConfigurationError,
+        EstimationError,
+        FieldcalError,
+        Refused,
+        UnreadableLog,
+        UnusableFlight,
+    )
+    from fieldcal.exports.apply import CalibratedReadings
+    from fieldcal.exports.calibration import Constants, Export, Triad
+    from fieldcal.simulation.archive import write_flights
+    from fieldcal.simulation.experiment import Experiment, simulate
+    from fieldcal.warehouse.errors import WarehouseError
+
+__all__ = [
+    "CalibratedReadings",
+    "Calibration",
+    "ConfigurationError",
+    "Constants",
+    "EllipsoidFit",
+    "Estimate",
+    "EstimationError",
+    "Experiment",
+    "Export",
+    "FieldcalError",
+    "JointEstimate",
+    "OutputErrorFit",
+    "Recording",
+    "Refused",
+    "SensorCalibration",
+    "Synchronisation",
+    "Triad",
+    "UnreadableLog",
+    "UnusableFlight",
+    "VpsClock",
+    "Warehouse",
+    "WarehouseError",
+    "apply",
+    "calibrate",
+    "export",
+    "fit_ellipsoid",
+    "fit_joint",
+    "fit_output_error",
+    "plot",
+    "read_log",
+    "simulate",
+    "synchronise",
+    "write_flights",
+]
+
+_NAMES_OF = {
+    "api.calibration": (
+        "Calibration",
+        "calibrate",
+    ),
+    "api.clock_sync": (
+        "Synchronisation",
+        "synchronise",
+    ),
+    "api.constants": (
+        "apply",
+        "export",
+    ),
+    "api.ellipsoid": (
+        "EllipsoidFit",
+        "fit_ellipsoid",
+    ),
+    "api.estimate": ("Estimate",),
+    "api.joint": (
+        "JointEstimate",
+        "fit_joint",
+    ),
+    "api.output_error": (
+        "OutputErrorFit",
+        "fit_output_error",
+    ),
+    "api.plot": ("plot",),
+    "api.recording": (
+        "Recording",
+        "read_log",
+    ),
+    "api.sensor": ("SensorCalibration",),
+    "api.vps_clock": ("VpsClock",),
+    "api.warehouse": ("Warehouse",),
+    "errors": (
+        "ConfigurationError",
+        "EstimationError",
+        "FieldcalError",
+        "Refused",
+        "UnreadableLog",
+        "UnusableFlight",
+    ),
+    "exports.apply": ("CalibratedReadings",),
+    "exports.calibration": (
+        "Constants",
+        "Export",
+        "Triad",
+    ),
+    "simulation.archive": ("write_flights",),
+    "simulation.experiment": (
+        "Experiment",
+        "simulate",
+    ),
+    "warehouse.errors": ("WarehouseError",),
+}
+"""Module → public names. They are loaded when they are asked for: `fieldcal --help` needs none of them."""
+
+if not TYPE_CHECKING:  # mypy would let every misspelt name pass
+
+    def __getattr__(name: str) -> object:
+        from importlib import import_module
+
+        for module, names in _NAMES_OF.items():
+            if name in names:
+                globals()[name] = value = getattr(import_module(f"fieldcal.{module}"), name)
+                return value
+        raise AttributeError(f"module 'fieldcal' has no attribute {name!r}")
+
+    def __dir__() -> list[str]:
+        return sorted([*globals(), *__all__])

@@ -23,6 +23,15 @@ class FieldcalError(Exception):
         What happened and what to do next.
     measured : mapping, optional
         The numbers that decided it.
+
+    Examples
+    --------
+    >>> import fieldcal
+    >>> try:
+    ...     fieldcal.read_log("nowhere.mcap")
+    ... except fieldcal.FieldcalError as error:
+    ...     print(error.reason_code)
+    not_found
     """
 
     def __init__(self, reason_code: ReasonCode, sentence: str, measured: Mapping[str, Any] | None = None) -> None:
@@ -37,19 +46,79 @@ class FieldcalError(Exception):
 
 
 class ConfigurationError(FieldcalError):
-    """The configuration is wrong: nothing runs until it is mended."""
+    """The configuration is wrong: nothing runs until it is mended.
+
+    Examples
+    --------
+    >>> import fieldcal
+    >>> try:
+    ...     fieldcal.read_log("flight.mcap", config="nowhere.toml")
+    ... except fieldcal.ConfigurationError as error:
+    ...     print(error)
+    nowhere.toml: there is no such file.
+    """
 
 
 class UnreadableLog(FieldcalError):
-    """This log cannot be read, or holds nothing usable. Other logs are not concerned."""
+    """This log cannot be read, or holds nothing usable. Other logs are not concerned.
+
+    Streaming a log raises it; `fieldcal.read_log` gives a recording with verdict "rejected" instead.
+
+    Examples
+    --------
+    >>> import fieldcal
+    >>> raise fieldcal.UnreadableLog("empty_file", "flight.mcap is empty.")
+    Traceback (most recent call last):
+    ...
+    fieldcal.errors.UnreadableLog: flight.mcap is empty.
+    """
 
 
 class UnusableFlight(FieldcalError):
-    """The recording does not determine what was asked of it (planar motion, no excitation, flat peak)."""
+    """The recording does not determine what was asked of it (planar motion, no excitation, flat peak).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import fieldcal
+    >>> try:
+    ...     fieldcal.fit_ellipsoid(np.ones((20, 3)), 1.0)
+    ... except fieldcal.UnusableFlight as error:
+    ...     print(error.reason_code)
+    ellipsoid_degenerate
+    """
 
 
 class EstimationError(FieldcalError):
-    """Enough information, yet the estimator reached no minimum."""
+    """Enough information, yet the estimator reached no minimum.
+
+    Examples
+    --------
+    >>> import fieldcal
+    >>> error = fieldcal.EstimationError("joint_diverged", "No minimum was found.", {"iterations": 50})
+    >>> error.reason_code, error.measured
+    ('joint_diverged', {'iterations': 50})
+    """
+
+
+class Refused(FieldcalError):
+    """A value was asked for that fieldcal refused; the sentence says why.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import fieldcal
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     never_turned_about_z = fieldcal.Experiment(duration_s=20.0, turned=(1.0, 1.0, 0.0))
+    ...     log = fieldcal.write_flights(folder, never_turned_about_z)[0]
+    ...     calibration = fieldcal.calibrate(log)
+    >>> calibration.magnetometer.scale.value
+    Traceback (most recent call last):
+    ...
+    fieldcal.errors.Refused: The magnetometer's scale by ellipsoid_robust was refused. Magnetometer: ...
+    >>> calibration.magnetometer.scale.refused_value().shape
+    (3,)
+    """
 
 
 def unforeseen(log_uri: str, error: Exception) -> str:

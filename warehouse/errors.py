@@ -12,7 +12,17 @@ from fieldcal.reason_codes import ReasonCode
 
 
 class WarehouseError(FieldcalError):
-    """The warehouse cannot be read or written as asked; what it held before is still there."""
+    """The warehouse cannot be read or written as asked; what it held before is still there.
+
+    Examples
+    --------
+    >>> import fieldcal
+    >>> try:
+    ...     fieldcal.Warehouse("nowhere").history()
+    ... except fieldcal.WarehouseError as error:
+    ...     print(error.reason_code)
+    no_warehouse
+    """
 
 
 _KNOWN = {

@@ -44,11 +44,6 @@ def calibration_history(
     return rows.select(COLUMNS).sort(order, nulls_last=True).collect()
 
 
-def answer(root: Path, query: str) -> pl.DataFrame:
-    """One SELECT over the tables and views."""
-    return existing(root).sql(query)
-
-
 def existing(root: Path) -> Warehouse:
     """The warehouse at `root`.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import fieldcal
 from fieldcal.cli.options import AsCsv, AsJson, Root, UnusedConfig
 
 SHOWN = (
@@ -51,9 +52,7 @@ def drift(
         scale, bias, zero, zero_bias, lag, skew, tic_attitude, ...
     """
     from fieldcal.cli.show import print_frame
-    from fieldcal.trends.drift_table import drift_rows
-    from fieldcal.warehouse import Warehouse
 
-    rows = drift_rows(Warehouse(warehouse).root, vehicle, sensor, parameter)
+    rows = fieldcal.Warehouse(warehouse).drift(vehicle=vehicle, sensor=sensor, parameter=parameter)
     print_frame(rows if as_json or as_csv else rows.select(SHOWN), as_json=as_json, as_csv=as_csv)
     return 0

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+import fieldcal
 from fieldcal.cli.options import AsJson, Config, Output, Root, UnusedConfig
 from fieldcal.reason_codes import ReasonCode
 
@@ -36,13 +37,10 @@ def export(
     output
         File to write; else stdout.
     """
-    from fieldcal.exports import FORMATS
-    from fieldcal.exports.calibration_at import constants_of
-    from fieldcal.warehouse import Warehouse
     from fieldcal.warehouse.files import write_bytes
     from fieldcal.words.talk import say
 
-    result = FORMATS[to](constants_of(Warehouse(warehouse).root, vehicle, at_temperature))
+    result = fieldcal.export(fieldcal.Warehouse(warehouse).calibration_at(vehicle, at_temperature), to)
     for warning in result.warnings:
         say(warning)
     if output is None:
@@ -78,18 +76,14 @@ def apply(
         °C; else each sample's own temperature, 25 where the log has none.
     """
     from fieldcal.cli.show import print_json
-    from fieldcal.exports.apply import apply_constants, write_parquet, write_ros
-    from fieldcal.warehouse import Warehouse
     from fieldcal.words.talk import say
 
     _keep(log, output)
-    calibrated = apply_constants(log, Warehouse(warehouse).root, config, vehicle, at_temperature)
-    warnings = list(calibrated.warnings)
-    if output.suffix.lower() == ".mcap":
-        warnings += write_ros(calibrated, output)
-        written = [output]
-    else:
-        written = write_parquet(calibrated, output)
+    recording = fieldcal.read_log(log, config=config, vehicle=vehicle)
+    constants = fieldcal.Warehouse(warehouse).calibration_at(recording.vehicle_id, at_temperature)
+    calibrated = fieldcal.apply(recording, constants, follow_temperature=at_temperature is None)
+    written, unsaid = calibrated.write(output)
+    warnings = [*calibrated.warnings, *unsaid]
     for warning in warnings:
         say(warning)
     if as_json:
@@ -102,10 +96,7 @@ def apply(
 
 def _keep(log: Path, output: Path) -> None:
     """Refuse to write over the log or into it, by whatever name."""
-    from fieldcal.errors import FieldcalError
-
     own, place = log.resolve(), output.resolve()
     if place == own or own in place.parents or (output.exists() and log.exists() and output.samefile(log)):
-        raise FieldcalError(
-            ReasonCode.WRONG_OPTION, f"{output} is the log itself, which is only ever read; name another place."
-        )
+        told = f"{output} is the log itself, which is only ever read; name another place."
+        raise fieldcal.FieldcalError(ReasonCode.WRONG_OPTION, told)

@@ -87,23 +87,19 @@ def calibrate(
         Overrule a stage parameter: --set smoothing_cutoff_hz=6.
     """
     from fieldcal.cli.show import console, print_json
-    from fieldcal.flight.calibrate import run_log
     from fieldcal.words.talk import say
 
     changes = _assignments(set_ or [])
-    result = run_log(log, config, vehicle_id=vehicle, profile=profile, method=method, changes=changes)
-    document = result.document
+    result = fieldcal.calibrate(log, method=method, profile=profile, parameters=changes, config=config, vehicle=vehicle)
     if report is not None:
-        from fieldcal.report import log_report
-
-        say(f"Report: {log_report(result, report)}")
+        say(f"Report: {result.report(report)}")
     if as_json:
-        print_json(document)
+        print_json(result.document)
     else:
         from fieldcal.cli.present_flight import print_flight
 
-        print_flight(console(), document)
-    return OK if document["flight"]["verdict"] == Verdict.OK else LOSSES
+        print_flight(console(), result.document)
+    return OK if result.verdict == Verdict.OK else LOSSES
 
 
 @app.command
@@ -181,9 +177,8 @@ def history(
         Only flights that started then or later: 2026-05-04 or 2026-05-04T12:00.
     """
     from fieldcal.cli.show import print_frame
-    from fieldcal.warehouse.questions import calibration_history
 
-    rows = calibration_history(_root(warehouse), vehicle, sensor, parameter, since)
+    rows = fieldcal.Warehouse(warehouse).history(vehicle=vehicle, sensor=sensor, parameter=parameter, since=since)
     whole = as_json or as_csv
     print_frame(rows if whole else rows.drop("imu_id", "session_id", "flight_id"), as_json=as_json, as_csv=as_csv)
     return OK
@@ -201,9 +196,8 @@ def sql(
         "SELECT …"
     """
     from fieldcal.cli.show import print_frame
-    from fieldcal.warehouse.questions import answer
 
-    print_frame(answer(_root(warehouse), query), as_json=as_json, as_csv=as_csv)
+    print_frame(fieldcal.Warehouse(warehouse).sql(query), as_json=as_json, as_csv=as_csv)
     return OK
 
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+import fieldcal
 from fieldcal.cli.options import AsJson, UnusedConfig, UnusedRoot
 from fieldcal.reason_codes import ReasonCode
 
@@ -85,11 +86,9 @@ def simulate(
         Leave it out.
     """
     from fieldcal.cli.show import print_json
-    from fieldcal.simulation.archive import write_flights
-    from fieldcal.simulation.experiment import Experiment
     from fieldcal.words.talk import say
 
-    experiment = Experiment(
+    experiment = fieldcal.Experiment(
         seed=seed,
         duration_s=duration,
         translation_rms_mps2=translation_rms,
@@ -125,7 +124,7 @@ def simulate(
     ):
         if not 0 <= share < 1:
             raise _wrong(f"{name} is a share: from 0 to below 1.")
-    logs = write_flights(
+    logs = fieldcal.write_flights(
         folder, experiment, vehicles=vehicles, sessions=sessions, flights=flights, log_format=log_format
     )
     if as_json:

@@ -3,22 +3,23 @@ read."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 
-from fieldcal.config.find import CONFIG_NAME, configuration_of, find_source
+from fieldcal.config.configuration import Vehicle
 from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.errors import FieldcalError
 from fieldcal.exports.calibration import Constants, Triad
-from fieldcal.exports.calibration_at import constants_of
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.earth_field import UNIT_IN_TESLA
 from fieldcal.geometry.frames import FRD_FROM_FLU
 from fieldcal.geometry.rotation import Array
 from fieldcal.logs import ingest
+from fieldcal.logs.facts import Facts
 from fieldcal.logs.mcap.write import imu_channel, magnetic_field_channel, temperature_channel, write_mcap
 from fieldcal.names import INERTIAL_FIRST, Sensor, Verdict
 from fieldcal.reason_codes import ReasonCode
@@ -32,8 +33,34 @@ SPECIFIC_FORCE = {"gravity": -1.0, "specific_force": 1.0}
 
 
 @dataclass(frozen=True)
-class Calibrated:
-    """Readings z of a log, sensor → (stamps ns, (n, 3) in the sensor axes as logged), and what was known for them."""
+class CalibratedReadings:
+    """Readings of a log put through constants, and what was known for it.
+
+    Attributes
+    ----------
+    readings : dict of str to (array, array)
+        Sensor → stamps (n,) int64 ns on the log's own clock, and z (n, 3) in the unit of its constants, sensor axes as
+        logged, gravity sign as declared.
+    temperature : DataFrame or None
+        The log's temperatures, °C, where each sample's own was followed.
+    settings : FlightSettings
+        The flight's settings: axes, signs, units.
+    constants : Constants
+        What was applied.
+    warnings : tuple of str
+        Sensors that were left out, and temperatures beyond those flown.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import fieldcal
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     log = fieldcal.write_flights(folder, fieldcal.Experiment(duration_s=20.0))[0]
+    ...     calibrated = fieldcal.apply(log, fieldcal.calibrate(log))
+    ...     written, _ = calibrated.write(f"{folder}/calibrated.mcap")
+    >>> sorted(calibrated.readings), [path.name for path in written]
+    (['accelerometer', 'gyroscope', 'magnetometer'], ['calibrated.mcap'])
+    """
 
     readings: dict[Sensor, tuple[np.ndarray, Array]]
     temperature: pl.DataFrame | None
@@ -41,31 +68,43 @@ class Calibrated:
     constants: Constants
     warnings: tuple[str, ...]
 
+    def write(self, output: Path | str) -> tuple[list[Path], tuple[str, ...]]:
+        """Write the readings; the files, and what the format cannot say.
+
+        Parameters
+        ----------
+        output : Path or str
+            ``NAME.mcap``: one file of ROS 2 Imu and MagneticField in body axes (REP-103). Anything else: a folder for
+            imu.parquet and magnetometer.parquet, in the sensor axes as logged.
+        """
+        place = Path(output)
+        if place.suffix.lower() == ".mcap":
+            return [place], write_ros(self, place)
+        return write_parquet(self, place), ()
+
 
 def apply_constants(
-    log: Path, root: Path, config: Path | None, vehicle_id: str | None, temperature_degc: float | None
-) -> Calibrated:
-    """Read a log and calibrate it: at `temperature_degc`, or at each sample's own where the log has temperatures.
+    log: str,
+    vehicle: Vehicle,
+    signals: Mapping[str, pl.DataFrame],
+    facts: Facts,
+    constants: Constants,
+    *,
+    follow_temperature: bool,
+) -> CalibratedReadings:
+    """Calibrate the readings of a log, called `log` in messages, as `ingest.read_flight` gives them: at the constants'
+    temperature, or at each sample's own where the log has temperatures.
 
     Raises
     ------
     FieldcalError
-        `not_found`; `no_calibration`; `unit_mismatch`: the log's readings are in another unit than the constants;
-        `not_usable`: nothing can be read.
+        `no_calibration`; `unit_mismatch`: the log's readings are in another unit than the constants; `not_usable`:
+        nothing can be read.
     """
-    log = log.absolute()
-    if not log.exists():
-        raise FieldcalError(ReasonCode.NOT_FOUND, f"There is no log at {log}.")
-    own = log.parent.parent.parent / CONFIG_NAME
-    vehicle = configuration_of(find_source(config or (own if own.is_file() else None), None)).vehicle(
-        vehicle_id or log.parent.parent.name
-    )
-    constants = constants_of(root, vehicle.vehicle_id, temperature_degc)
-    signals, facts = ingest.read_flight(log, vehicle)
     if not Verdict(facts["verdict"]).usable:
-        raise FieldcalError(ReasonCode.NOT_USABLE, f"{log.name}: {facts['reason']}")
+        raise FieldcalError(ReasonCode.NOT_USABLE, f"{log}: {facts['reason']}")
     settings = ingest.settings_of(facts, vehicle)
-    temperature = signals.get("temperature") if temperature_degc is None else None
+    temperature = signals.get("temperature") if follow_temperature else None
     readings, warnings = {}, []
     for name in INERTIAL_FIRST:
         table = signals.get(TABLE_OF[name])
@@ -78,18 +117,18 @@ def apply_constants(
         if constant.logged_unit != settings.units[name]:
             raise FieldcalError(
                 ReasonCode.UNIT_MISMATCH,
-                f"{log.name}: the {name} is in {settings.units[name]}, the constants are for {constant.logged_unit};"
+                f"{log}: the {name} is in {settings.units[name]}, the constants are for {constant.logged_unit};"
                 " give the vehicle whose log this is (--vehicle), or its units in fieldcal.toml.",
             )
         t_ns = table["t_ns"].to_numpy()
         readings[name] = t_ns, constant.apply(matrix(table, triad(name)), _temperature_at(t_ns, temperature))
         warnings += _outside(name, constant, temperature)
     if not readings:
-        raise FieldcalError(ReasonCode.NO_CALIBRATION, f"{log.name}: no sensor of this log has constants.")
-    return Calibrated(readings, signals.get("temperature"), settings, constants, tuple(warnings))
+        raise FieldcalError(ReasonCode.NO_CALIBRATION, f"{log}: no sensor of this log has constants.")
+    return CalibratedReadings(readings, signals.get("temperature"), settings, constants, tuple(warnings))
 
 
-def write_parquet(c: Calibrated, folder: Path) -> list[Path]:
+def write_parquet(c: CalibratedReadings, folder: Path) -> list[Path]:
     """imu.parquet and magnetometer.parquet: the signal tables with calibrated values, in the sensor axes as logged."""
     with disk(folder, "made"):
         folder.mkdir(parents=True, exist_ok=True)
@@ -120,7 +159,7 @@ def write_parquet(c: Calibrated, folder: Path) -> list[Path]:
     return written
 
 
-def write_ros(c: Calibrated, path: Path) -> tuple[str, ...]:
+def write_ros(c: CalibratedReadings, path: Path) -> tuple[str, ...]:
     """One MCAP of `sensor_msgs/Imu` and `MagneticField` by REP-103 and 145: body axes forward, left, up; specific
     force; rad/s, m/s² and tesla. What it cannot say is returned."""
     body = FLU_FROM_FRD @ sensor_model.frd_from_sensor(c.settings.rotation_body_from_sensor, c.settings.body)

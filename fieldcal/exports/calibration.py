@@ -24,12 +24,33 @@ def cubic_about(first: Array, second: Array, third: Array, by_degc: float) -> tu
 
 @dataclass(frozen=True)
 class Triad:
-    """Constants of one triad at `temperature_degc` T0, sensor axes as logged.
+    """Constants of one triad at `temperature_degc` T0, sensor axes as logged: z = Λ(T)(z_d − zero(T)).
 
-    `scale` (3, 3) in `unit` per `logged_unit`, `zero` (3,) in `logged_unit`, their slopes per °C (0 where unknown), the
-    zero's bend per °C² and °C³ (0 where none is known),
-    sd of the diagonal and of zero (3,). `flown_degc`: lowest and highest temperature of the history, None without a
-    slope. `why`: where the numbers come from.
+    Attributes
+    ----------
+    scale, scale_per_degc : (3, 3) array
+        Λ in `unit` per `logged_unit`, and its slope per °C (0 where unknown).
+    zero, zero_per_degc, zero_per_degc2, zero_per_degc3 : (3,) array
+        In `logged_unit`, and its slope and bend per °C, °C² and °C³ (0 where unknown).
+    scale_sd, zero_sd : (3,) array
+        One standard deviation of Λ's diagonal and of zero; NaN where unknown.
+    unit, logged_unit : str
+        Of calibrated and of logged readings.
+    temperature_degc : float
+        T0, °C.
+    flown_degc : (float, float) or None
+        Lowest and highest temperature of the history, °C; None without a slope.
+    why : tuple of str
+        Where the numbers come from.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> nothing = np.zeros(3)
+    >>> triad = Triad(np.diag([2.0, 2.0, 4.0]), np.ones(3), np.zeros((3, 3)), nothing, nothing, nothing, "deg/s",
+    ...               "counts", 25.0, None, ())
+    >>> triad.apply([[1.0, 2.0, 3.0]])
+    array([[0., 2., 8.]])
     """
 
     scale: Array
@@ -65,13 +86,27 @@ class Triad:
 
 @dataclass(frozen=True)
 class Constants:
-    """What a vehicle flies with: sensor → triad, and who and when."""
+    """What a vehicle flies with.
+
+    Attributes
+    ----------
+    vehicle_id, imu_id : str
+        Who.
+    triads : mapping of str to Triad
+        Sensor → its constants; a sensor without any is left out.
+    as_of : str
+        ISO 8601 of the latest flight that they come from; empty when its clock is unknown.
+
+    Examples
+    --------
+    >>> Constants("quad-1", "imu-7", {}, "2026-01-12").heading
+    'fieldcal: quad-1, IMU imu-7, as of 2026-01-12'
+    """
 
     vehicle_id: str
     imu_id: str
     triads: Mapping[Sensor, Triad]
     as_of: str
-    """ISO 8601 of the latest flight that they come from; empty when its clock is unknown."""
 
     @property
     def heading(self) -> str:
@@ -81,7 +116,14 @@ class Constants:
 
 @dataclass(frozen=True)
 class Export:
-    """A text in somebody else's format, and what that format cannot hold."""
+    """A text in somebody else's format, and what that format cannot hold.
+
+    Examples
+    --------
+    >>> import fieldcal
+    >>> fieldcal.export(fieldcal.Constants("quad-1", "quad-1", {}, ""), "json").warnings
+    ()
+    """
 
     text: str
     warnings: tuple[str, ...]

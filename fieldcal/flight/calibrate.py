@@ -8,7 +8,7 @@ from typing import Any
 
 import polars as pl
 
-from fieldcal.config.configuration import Configuration
+from fieldcal.config.configuration import Configuration, Vehicle
 from fieldcal.config.find import CONFIG_NAME, configuration_of, find_source, with_parameters
 from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.errors import FieldcalError, unforeseen
@@ -36,6 +36,17 @@ class CalibratedLog:
     settings: FlightSettings | None
 
 
+@dataclass(frozen=True)
+class LogRead:
+    """A log in memory before any stage: what it is, its vehicle's configuration, signal table → frame, and the facts
+    (`ingest.TidyLog.facts`)."""
+
+    job: Job
+    vehicle: Vehicle
+    signals: dict[str, pl.DataFrame]
+    facts: Facts
+
+
 def calibrate_log(log: Path, config: Path | None = None, **choices: Any) -> dict[str, Any]:
     """Calibrate one log; its flight, calibration, fit, sync and run, named as the columns of those tables. Arguments
     and errors as in `run_log`."""
@@ -52,15 +63,26 @@ def run_log(
     method: str | None = None,
     changes: dict[str, str] | None = None,
 ) -> CalibratedLog:
-    """Calibrate one log; what it says, and all tables on the way.
+    """Calibrate one log; what it says, and all tables on the way. Errors as in `read`.
+
+    `profile`, `method` and `changes` overrule the configuration's own.
+    """
+    job, vehicle = identify(log, config, vehicle_id=vehicle_id, session_id=session_id)
+    return run_stages(read(job, overruled(vehicle, profile=profile, method=method, changes=changes)))
+
+
+def identify(
+    log: Path, config: Path | None = None, *, vehicle_id: str | None = None, session_id: str | None = None
+) -> tuple[Job, Vehicle]:
+    """What a log is and how its vehicle is configured.
 
     Vehicle and session are taken from the folders the log lies in, `<vehicle>/<session>/<log>`, unless given; the
-    configuration from `fieldcal.toml` above them, unless given. `profile`, `method` and `changes` overrule its own.
+    configuration from `fieldcal.toml` above them, unless given.
 
     Raises
     ------
     ConfigurationError
-        The configuration or an override is wrong.
+        The configuration is wrong.
     FieldcalError
         `not_found`, `not_readable`: there is no such log.
     """
@@ -69,13 +91,36 @@ def run_log(
     configuration = _configuration(config, archive)
     vehicle_id = vehicle_id or log.parent.parent.name
     job = _job(log, vehicle_id, session_id or log.parent.name, archive)
-    vehicle = with_parameters(configuration.vehicle(vehicle_id), profile, changes or {})
-    if method is not None:
-        vehicle = vehicle.model_copy(update={"method": dict.fromkeys(SENSORS, Approach(method))})
-    signals, facts = ingest.read_flight(log, vehicle)
+    return job, configuration.vehicle(vehicle_id)
+
+
+def overruled(
+    vehicle: Vehicle, *, profile: str | None = None, method: str | None = None, changes: dict[str, str] | None = None
+) -> Vehicle:
+    """The vehicle with other presets, another method, other stage parameters (name → text).
+
+    Raises
+    ------
+    ConfigurationError
+        An override is wrong.
+    """
+    vehicle = with_parameters(vehicle, profile, changes or {})
+    if method is None:
+        return vehicle
+    return vehicle.model_copy(update={"method": dict.fromkeys(SENSORS, Approach(method))})
+
+
+def read(job: Job, vehicle: Vehicle) -> LogRead:
+    """A whole log in memory; what cannot be read has verdict `rejected` and no signals."""
+    return LogRead(job, vehicle, *ingest.read_flight(Path(job.path), vehicle))
+
+
+def run_stages(log: LogRead) -> CalibratedLog:
+    """Every stage on a log that was read."""
+    job, vehicle, facts = log.job, log.vehicle, log.facts
     records: dict[str, StepRecord] = {INGEST: _record(_ingest_result(facts))}
     settings: FlightSettings | None = None
-    tables: dict[str, pl.DataFrame] = {f"{INGEST}.{name}": frame for name, frame in signals.items()}
+    tables: dict[str, pl.DataFrame] = {f"{INGEST}.{name}": frame for name, frame in log.signals.items()}
     if Verdict(facts["verdict"]).usable:
         settings = ingest.settings_of(facts, vehicle)
         for stage in PIPELINE:

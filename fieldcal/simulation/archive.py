@@ -24,7 +24,7 @@ LATENCY_NS = {"imu": 400_000, "vps": 4_800_000}
 
 
 def write_flights(
-    folder: Path,
+    folder: Path | str,
     experiment: Experiment | None = None,
     *,
     vehicles: int = 1,
@@ -41,12 +41,27 @@ def write_flights(
 
     Parameters
     ----------
+    folder : Path or str
+        The archive's folder; it is made.
+    experiment : Experiment, optional
+        What is flown; default: the paper's.
+    vehicles, sessions, flights : int
+        How many vehicles, sessions of each, flights in each.
     log_format : {"mcap", "csv"}
         One MCAP file, or a folder with imu.csv and vps.csv.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import fieldcal
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     logs = fieldcal.write_flights(folder, fieldcal.Experiment(duration_s=10.0), flights=2)
+    >>> [log.name for log in logs]
+    ['flight-01.mcap', 'flight-02.mcap']
     """
     if log_format not in ("mcap", "csv"):
         raise ValueError(f'log_format is "mcap" or "csv", not {log_format!r}')
-    base = experiment or Experiment()
+    base, folder = experiment or Experiment(), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     logs = []
     described = []

@@ -42,6 +42,11 @@ class Experiment:
 
     `scale` and `bias` map a sensor to its constants at 25 °C. Temperature: λ(T) = λ (1 + c_s ΔT), and the value at
     mid-scale (32768 counts) moves by c_b ΔT, ΔT = T − 25 °C.
+
+    Examples
+    --------
+    >>> Experiment(duration_s=20.0, dip_rad=1.1).rate_hz
+    185.0
     """
 
     seed: int = 0
@@ -206,7 +211,36 @@ def _sinusoids(
 
 
 def simulate(experiment: Experiment | None = None, **changes: object) -> Recording:
-    """Fly one experiment. `changes` replace fields of `experiment` (default: the paper's)."""
+    """Fly one experiment in memory: arrays of what is logged, and the truth.
+
+    Parameters
+    ----------
+    experiment : Experiment, optional
+        Default: the paper's.
+    **changes
+        Replace fields of it.
+
+    Returns
+    -------
+    Recording
+        `t` (n,) s, `counts` (sensor → (n, 3)), `vps_t`, `vps_q`, …, and the truth beside them.
+
+    Raises
+    ------
+    TypeError
+        `Experiment` has no such field.
+
+    References
+    ----------
+    Grauer et al., AIAA 2009-2064, Tables 1–4.
+
+    Examples
+    --------
+    >>> import fieldcal
+    >>> flight = fieldcal.simulate(seed=1, duration_s=20.0, noise=False)
+    >>> flight.counts["gyroscope"].shape, flight.q.shape, round(flight.lag_s, 2)
+    ((3700, 3), (3700, 4), -0.37)
+    """
     e = replace(experiment or Experiment(), **changes)  # type: ignore[arg-type]
     # Separate streams: switching one effect on or off leaves the others' draws alone.
     streams = dict(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import polars as pl
+from numpy.typing import ArrayLike
 
 from fieldcal.config.stage_settings import JointSettings
 from fieldcal.errors import EstimationError, UnusableFlight
@@ -106,7 +107,7 @@ def _held_out(
         own = model_selection.with_terms(own, kept) if kept else own
     except (UnusableFlight, EstimationError):
         return {}
-    matrix, bias, covariance, _ = _triad(own, "gyroscope")
+    matrix, bias, covariance, _ = triad_of(own, "gyroscope")
     rows = triad_rows(
         Sensor.GYROSCOPE,
         Method.JOINT,
@@ -188,7 +189,7 @@ def _written(fit: JointFit, tables: Tables, s: JointSettings, axes: Array) -> St
     for name in chosen(s):
         if name not in fit.layout:
             continue
-        full, bias, covariance, cross_sd = _triad(fit, name)
+        full, bias, covariance, cross_sd = triad_of(fit, name)
         codes[name] = _judged(name, fit, np.diagonal(full), covariance, s)
         rows += triad_rows(
             name,
@@ -216,13 +217,13 @@ def _written(fit: JointFit, tables: Tables, s: JointSettings, axes: Array) -> St
             "None of the sensors that method joint is chosen for has readings.",
         )
     result = {"calibration": calibration_rows(rows), "covariance": covariance_table(fit.covariance)}
-    full, _, covariance, _ = _triad(fit, "gyroscope")
+    full, _, covariance, _ = triad_of(fit, "gyroscope")
     if not any(_judged(Sensor.GYROSCOPE, fit, np.diagonal(full), covariance, s)):
         result["trajectory"] = _trajectory(fit, tables, axes)
     return StageResult(result, Status.REFUSED if every else Status.OK, first, reason, measured)
 
 
-def _triad(fit: JointFit, name: str) -> tuple[Array, Array, Array, Array | None]:
+def triad_of(fit: JointFit, name: str) -> tuple[Array, Array, Array, Array | None]:
     """Λ (3, 3), b (3,), covariance (6, 6) of its diagonal and b, and the sd (3, 3) of Λ where it has cross-axis
     terms."""
     if f"{name}_cross" not in fit.layout:
@@ -254,23 +255,45 @@ def _slope_rows(
 
 
 def _judged(name: Sensor, fit: JointFit, scale: Array, covariance: Array, s: JointSettings) -> list[ReasonCode | None]:
-    """Why an axis is refused, or None."""
+    """`judged` by the flight's settings."""
+    return judged(
+        name,
+        fit,
+        scale,
+        covariance,
+        polarity=s.polarity[name],
+        nominal_scale=s.nominal_scale[name],
+        max_scale_sd=s.gyro_max_scale_sd if name == Sensor.GYROSCOPE else s.ellipsoid_max_scale_sd,
+        max_residual=s.ellipsoid_max_residual,
+    )
+
+
+def judged(
+    name: Sensor,
+    fit: JointFit,
+    scale: Array,
+    covariance: Array,
+    *,
+    polarity: ArrayLike,
+    nominal_scale: ArrayLike | None,
+    max_scale_sd: float,
+    max_residual: float,
+) -> list[ReasonCode | None]:
+    """Why an axis is refused, or None: scale (3,), covariance (6, 6) of scale and bias, `polarity` (3,) of ±1,
+    `nominal_scale` (3,) where it is known; limits are relative."""
     if name == Sensor.GYROSCOPE:
         if gyro_noise_share(fit) > MAX_GYRO_NOISE_SHARE:
             return [ReasonCode.GYRO_CONTRADICTS_ATTITUDE] * 3
-        limit = s.gyro_max_scale_sd
-    else:
-        if misfit(fit, name) > s.ellipsoid_max_residual:
-            return [ReasonCode.NOT_A_SPHERE] * 3
-        limit = s.ellipsoid_max_scale_sd
+    elif misfit(fit, name) > max_residual:
+        return [ReasonCode.NOT_A_SPHERE] * 3
     relative = np.sqrt(np.diagonal(covariance)[:3]) / np.abs(scale)
-    polarity = np.array(s.polarity[name], dtype=np.float64)
-    nominal = s.nominal_scale[name]
+    polarity = np.asarray(polarity, dtype=float)
+    nominal = None if nominal_scale is None else np.asarray(nominal_scale, dtype=float)
     noisy = axis_noise_share(fit) > MAX_GYRO_NOISE_SHARE if name == Sensor.GYROSCOPE else np.zeros(3, dtype=bool)
     out: list[ReasonCode | None] = []
     for i in range(3):
         ratio = 1.0 if nominal is None else abs(scale[i] / nominal[i])
-        if not relative[i] <= limit:
+        if not relative[i] <= max_scale_sd:
             out.append(ReasonCode.SCALE_UNCERTAIN)
         elif noisy[i]:
             out.append(ReasonCode.AXIS_NOT_TURNED)

@@ -11,7 +11,7 @@ from scipy.signal import welch
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation import wahba
 from fieldcal.estimation.ellipsoid import fit_ellipsoid
-from fieldcal.estimation.gyroscope.equation_error import fit_equation_error
+from fieldcal.estimation.gyroscope.equation_error import GyroFit, fit_equation_error
 from fieldcal.estimation.gyroscope.output_error import propagate_stretches
 from fieldcal.estimation.joint.chain_solver import STATES, place_knots
 from fieldcal.estimation.joint.problem import Model, Readings, State, averaging_side
@@ -141,7 +141,7 @@ def _start_attitude(
             sensed[name] = _filled(r.t, logged) * start[0] + start[1]
     if len(sensed) == 2 and gyro is None:
         both = {name: low_passed(r.t, r.segment, x, START_CUTOFF_HZ, 0.5) for name, x in sensed.items()}
-        gyro = _gyro_from_attitude(r, continuous(_turned_to(r, both)))
+        gyro = _gyro_start(r, continuous(_turned_to(r, both)))
     if not sensed or gyro is None:
         raise UnusableFlight(
             ReasonCode.NO_START,
@@ -200,16 +200,20 @@ def _filled(t: Array, x: Array) -> Array:
     return x if valid.all() else np.column_stack([np.interp(t, t[valid], c[valid]) for c in x.T])
 
 
-def _gyro_from_attitude(r: Readings, q: Array) -> Constants:
-    """Equation error on the start's attitudes, both sides low-passed alike."""
-    logged = low_passed(r.t, r.segment, r.gyroscope, START_CUTOFF_HZ, 0.5)
-    q_dot = np.empty_like(q)
-    for a, b in run_bounds(r.segment):
-        q_dot[a:b] = differentiate_samples(r.t[a:b], q[a:b], window_s=0.05)
+def _gyro_start(r: Readings, q: Array) -> Constants:
     try:
-        fit = fit_equation_error(q, q_dot, logged)
+        fit = gyro_from_attitude(r.t, r.segment, r.gyroscope, q)
     except UnusableFlight as error:
         raise UnusableFlight(
             ReasonCode.NO_START, f"The joint estimate found no start for the gyroscope: {error}"
         ) from error
     return fit.scale, fit.bias
+
+
+def gyro_from_attitude(t: Array, segment: np.ndarray, gyroscope: Array, q: Array) -> GyroFit:
+    """Equation error on attitudes q (n, 4), hemisphere continuous: both sides low-passed alike."""
+    logged = low_passed(t, segment, gyroscope, START_CUTOFF_HZ, 0.5)
+    q_dot = np.empty_like(q)
+    for a, b in run_bounds(segment):
+        q_dot[a:b] = differentiate_samples(t[a:b], q[a:b], window_s=0.05)
+    return fit_equation_error(q, q_dot, logged)

@@ -1,0 +1,1 @@
+"""Pictures of results for a notebook: arrays and frames in, matplotlib's axes out."""
