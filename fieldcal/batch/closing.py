@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from fieldcal.batch.sources import TRENDS, sources
 from fieldcal.config.configuration import Alerts
 from fieldcal.schemas import TABLES
 from fieldcal.schemas.arrow import VERSION_KEY
-from fieldcal.stages.run_key import code_digest
+from fieldcal.stages.run_key import run_key
 from fieldcal.trends.changes import Change, changes, last_usable
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.checksums import history_digest
@@ -87,8 +87,8 @@ def _forget_other_versions(root: Path) -> None:
 
 
 def _made_from(root: Path) -> str:
-    """Digest of what trends are made from: the history and the code."""
-    return hashlib.sha256(f"{history_digest(root, INPUTS)}\0{code_digest()}".encode()).hexdigest()
+    """Digest of what trends are made from: the history and the code that makes them of it."""
+    return run_key(TRENDS, sources()[TRENDS], {}, {"history": history_digest(root, INPUTS)})
 
 
 def _remembered(root: Path) -> Mapping[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fieldcal.batch.outcome import Outcome, failed_outcome
-from fieldcal.batch.source_ledger import know_sources
+from fieldcal.batch.sources import know_sources
 from fieldcal.batch.steps import STEPS, FlightWork
 from fieldcal.config.configuration import Configuration
 from fieldcal.config.find import Source, configuration_of

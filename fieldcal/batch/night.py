@@ -14,7 +14,7 @@ from fieldcal.batch.log_ledger import write_ledger
 from fieldcal.batch.outcome import Outcome, summary
 from fieldcal.batch.plan import Plan, make_plan
 from fieldcal.batch.publish_flights import publish_vehicle, withdraw
-from fieldcal.batch.source_ledger import know_sources
+from fieldcal.batch.sources import know_sources
 from fieldcal.config.configuration import Configuration
 from fieldcal.config.find import Source, configuration_of, find_source
 from fieldcal.flight.job import Job

@@ -7,7 +7,7 @@ and the history need to know: status, reason, measured numbers, versions, and th
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 import polars as pl
 
 from fieldcal.batch.reasons import NO_RESULT, why_it_runs
+from fieldcal.batch.sources import sources
 from fieldcal.config.configuration import Vehicle
 from fieldcal.errors import UnreadableLog, unforeseen
 from fieldcal.flight.job import Job, file_stamp
@@ -23,7 +24,7 @@ from fieldcal.logs import ingest
 from fieldcal.logs.tidy import Disordered
 from fieldcal.stages.pipeline import INGEST, PIPELINE, Stage, run_stage
 from fieldcal.stages.results import StageResult, plain
-from fieldcal.stages.run_key import run_key, source_digest
+from fieldcal.stages.run_key import run_key
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.files import file_sha256
 from fieldcal.warehouse.layout import signal_path
@@ -34,23 +35,6 @@ from fieldcal.warehouse.store import TableWriter
 STEPS = (INGEST, *(stage.name for stage in PIPELINE))
 STAGES: dict[str, Stage] = {stage.name: stage for stage in PIPELINE}
 Record = dict[str, Any]
-
-
-_sources: dict[str, str] = {}
-
-
-def step_sources() -> Mapping[str, str]:
-    """Digest of the source of every step, taken once in a process: what runs is what was imported."""
-    if not _sources:
-        functions: dict[str, Callable[..., Any]] = {name: stage.function for name, stage in STAGES.items()}
-        functions[INGEST] = ingest.tidy_log
-        _sources.update({step: source_digest(function) for step, function in functions.items()})
-    return _sources
-
-
-def take_sources(sources: Mapping[str, str]) -> None:
-    """Take digests that were worked out from the same code (`code_digest`)."""
-    _sources.update(sources)
 
 
 class FlightWork:
@@ -90,7 +74,7 @@ class FlightWork:
 
     def key(self, step: str) -> str:
         """run_key of a step; the records of the steps before it must be known."""
-        return run_key(step, step_sources()[step], self._params(step), self._hashes(step))
+        return run_key(step, sources()[step], self._params(step), self._hashes(step))
 
     def do(self, step: str) -> None:
         """Take a step's result from the cache, or run it."""
@@ -162,7 +146,7 @@ class FlightWork:
             "run_key": self.key(step),
             "params": plain(self._params(step)),
             "inputs": self._hashes(step),
-            "source": step_sources()[step],
+            "source": sources()[step],
             "versions": versions(),
         }
 

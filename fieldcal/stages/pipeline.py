@@ -47,13 +47,18 @@ ELLIPSOID = (
 )
 AXES = ("rotation_body_from_sensor", "body")
 SMOOTHING = ("smoothing_cutoff_hz", "smoothing_ends", "smoothing_side_s")
-VECTORS = ("attitude", "field_ned", "gravity_mps2", "gravity_sign", "nominal_scale", "polarity", "units", *AXES)
+VECTORS = ("field_ned", "gravity_mps2", "gravity_sign", "nominal_scale", "polarity", "units", *AXES)
 GYRO = ("gyro_max_scale_sd", "nominal_scale", "polarity", "units", "reference_reading", *AXES)
 EQUATION = ("equations", "differentiation_window_s", "smoothing_cutoff_hz", "smoothing_side_s")
 VPS = ("world", "vps_max_lag_s", "vps_min_peak", "vps_max_gap_s")
 FAULTS = {"faults": "sanity.faults"}
-SAMPLES = {"samples": "smoothing.samples", "temperature": "ingest.temperature", **FAULTS}
-MAGNETOMETER = {"magnetometer": "magnetometer.calibration", "magnetometer_covariance": "magnetometer.covariance"}
+SAMPLES = {"samples": "smoothing.samples"}
+TRIAD = {**SAMPLES, "temperature": "ingest.temperature", **FAULTS}
+MAGNETOMETER = {"magnetometer": "magnetometer.calibration"}
+COVARIANCES = {
+    "magnetometer_covariance": "magnetometer.covariance",
+    "accelerometer_covariance": "accelerometer_pass2.covariance",
+}
 
 PIPELINE: tuple[Stage, ...] = (
     Stage(
@@ -90,7 +95,7 @@ PIPELINE: tuple[Stage, ...] = (
     Stage(
         "magnetometer",
         vector_triads.calibrate_magnetometer,
-        {**SAMPLES, "magnetometer": "ingest.magnetometer", "segments": "manoeuvre.segments"},
+        {**TRIAD, "magnetometer": "ingest.magnetometer", "segments": "manoeuvre.segments"},
         ("samples", "segments"),
         ("calibration", "covariance"),
         (*ELLIPSOID, "field_ned", "field_unit"),
@@ -99,7 +104,7 @@ PIPELINE: tuple[Stage, ...] = (
     Stage(
         "accelerometer",
         vector_triads.calibrate_accelerometer,
-        SAMPLES,
+        TRIAD,
         ("samples",),
         ("calibration", "covariance"),
         (*ELLIPSOID, "gravity_mps2"),
@@ -108,16 +113,16 @@ PIPELINE: tuple[Stage, ...] = (
     Stage(
         "attitude",
         attitude.estimate_attitude,
-        {**SAMPLES, **MAGNETOMETER, "accelerometer": "accelerometer.calibration"},
+        {**SAMPLES, **FAULTS, **MAGNETOMETER, "accelerometer": "accelerometer.calibration"},
         ("samples",),
         ("attitude", "faults"),
-        (*VECTORS, "field_source"),
+        (*VECTORS, "attitude", "field_source"),
         attitude.VECTOR_SENSORS,
     ),
     Stage(
         "gyro_equation",
         gyroscope.calibrate_gyro_equation,
-        {**SAMPLES, "attitude": "attitude.attitude"},
+        {**TRIAD, "attitude": "attitude.attitude"},
         ("samples", "attitude"),
         ("calibration", "covariance"),
         (*GYRO, *EQUATION),
@@ -128,7 +133,7 @@ PIPELINE: tuple[Stage, ...] = (
         "accelerometer_pass2",
         vector_triads.calibrate_accelerometer_gated,
         {
-            **SAMPLES,
+            **TRIAD,
             "accelerometer": "accelerometer.calibration",
             "gyroscope": "gyro_equation.calibration",
         },
@@ -149,10 +154,10 @@ PIPELINE: tuple[Stage, ...] = (
     Stage(
         "attitude_pass2",
         attitude.estimate_attitude,
-        {**SAMPLES, **MAGNETOMETER, "accelerometer": "accelerometer_pass2.calibration"},
+        {**SAMPLES, **FAULTS, **MAGNETOMETER, "accelerometer": "accelerometer_pass2.calibration"},
         ("samples",),
         ("attitude", "faults"),
-        (*VECTORS, "field_source"),
+        (*VECTORS, "attitude", "field_source"),
         attitude.VECTOR_SENSORS,
     ),
     Stage(
@@ -175,10 +180,10 @@ PIPELINE: tuple[Stage, ...] = (
         "gyro_equation_pass2",
         gyroscope.calibrate_gyro_equation,
         {
-            **SAMPLES,
+            **TRIAD,
             **MAGNETOMETER,
             "accelerometer": "accelerometer_pass2.calibration",
-            "accelerometer_covariance": "accelerometer_pass2.covariance",
+            **COVARIANCES,
             "attitude": "attitude_pass2.attitude",
             "attitude_faults": "vectors.faults",
         },
@@ -191,10 +196,10 @@ PIPELINE: tuple[Stage, ...] = (
         "gyro_output",
         gyroscope.calibrate_gyro_output,
         {
-            **SAMPLES,
+            **TRIAD,
             **MAGNETOMETER,
             "accelerometer": "accelerometer_pass2.calibration",
-            "accelerometer_covariance": "accelerometer_pass2.covariance",
+            **COVARIANCES,
             "attitude": "attitude_pass2.attitude",
             "gyroscope": "gyro_equation_pass2.calibration",
         },
@@ -221,7 +226,7 @@ PIPELINE: tuple[Stage, ...] = (
         "joint",
         joint.estimate_jointly,
         {
-            **SAMPLES,
+            **TRIAD,
             "imu": "ingest.imu",
             "vps": "ingest.vps",
             "magnetometer_log": "ingest.magnetometer",
@@ -286,7 +291,7 @@ PIPELINE: tuple[Stage, ...] = (
         },
         ("samples",),
         ("fit",),
-        (*VECTORS, *SMOOTHING, "differentiation_window_s", "initial_attitude"),
+        (*VECTORS, *SMOOTHING, "attitude", "differentiation_window_s", "initial_attitude"),
     ),
 )
 
@@ -306,6 +311,15 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
 def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: Mapping[str, Any]) -> StageResult:
     """Run one stage on `stage.table` tables; missing needs end as a refusal that names them."""
     inputs = {own: tables[name] for own, name in stage.reads.items() if name in tables}
+    result = refused_beforehand(stage, inputs)
+    if result is None:
+        result = stage.function(inputs, {name: settings[name] for name in stage.settings})
+        _check_written(stage, result)
+    return result
+
+
+def refused_beforehand(stage: Stage, inputs: Mapping[str, pl.DataFrame]) -> StageResult | None:
+    """The refusal of a stage that is not to run on these inputs: a sensor is faulty, or something needed is missing."""
     # An attitude is as good as the vectors that it came from.
     for faults, sensors in (("faults", stage.trusts), ("attitude_faults", attitude.VECTOR_SENSORS)):
         fault = fatal_fault(inputs[faults], sensors) if faults in inputs else None
@@ -324,9 +338,7 @@ def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: Mappin
                 reason_code=f"no_{need}",
                 reason=f"{stage.name} needs {stage.reads[need]}, which {source} could not give.",
             )
-    result = stage.function(inputs, {name: settings[name] for name in stage.settings})
-    _check_written(stage, result)
-    return result
+    return None
 
 
 def _check_written(stage: Stage, result: StageResult) -> None:

@@ -9,9 +9,10 @@ import numpy as np
 import polars as pl
 
 from fieldcal.schemas import TABLES
-from fieldcal.stages.run_key import code_digest
+from fieldcal.stages.run_key import run_key, source_digest
 from fieldcal.trends import few_sessions, regression, siblings
 from fieldcal.trends.curves import Bends, Bent, bends_of, bent
+from fieldcal.trends.evidence import evidence
 from fieldcal.trends.evidence_cache import Memory
 from fieldcal.trends.reasons import AGREEMENT, VPS, reason
 from fieldcal.trends.series import ENOUGH_SESSIONS, Histories
@@ -47,7 +48,7 @@ def update_drift(root: Path) -> tuple[str, ...]:
     changed: set[str] = set()
     for _ in range(ATTEMPTS):
         before = _state(root)
-        memory = Memory(root, code_digest())
+        memory = Memory(root, run_key("evidence", source_digest(evidence), {}, {}))
         table = drift_table(root, memory)
         memory.save()
         for vehicle_id in sorted(set(table["vehicle_id"].to_list()) | _with_drift(root)):

@@ -1,0 +1,53 @@
+"""Digests of the source of every step and of the trends, remembered for as long as no file of the package changes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from fieldcal.logs import ingest
+from fieldcal.stages.pipeline import INGEST, PIPELINE, Stage, refused_beforehand
+from fieldcal.stages.run_key import code_digest, source_digest
+from fieldcal.warehouse.files import write_bytes
+from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
+
+TRENDS = "trends"
+NAMES = (INGEST, *(stage.name for stage in PIPELINE), TRENDS)
+
+_known: dict[str, str] = {}
+
+
+def sources() -> Mapping[str, str]:
+    """Digest by step, and of the `TRENDS`, taken once in a process: what runs is what was imported."""
+    if not _known:
+        from fieldcal.trends.drift_table import update_drift
+
+        _known.update({stage.name: stage_source(stage) for stage in PIPELINE})
+        _known[INGEST] = source_digest(ingest.tidy_log, ingest.logged_units, ingest.rejected)
+        _known[TRENDS] = source_digest(update_drift)
+    return _known
+
+
+def stage_source(stage: Stage) -> str:
+    """Digest of what a stage runs, and of what is declared of it that decides whether it runs at all."""
+    declared = json.dumps([sorted(stage.reads.items()), stage.needs, stage.trusts])
+    code = source_digest(stage.function, refused_beforehand)
+    return hashlib.blake2b(f"{code}{declared}".encode(), digest_size=16).hexdigest()
+
+
+def know_sources(root: Path, *, keep: bool) -> None:
+    """Take the digests that the root remembers of this very code; else work them out and, with `keep`, remember."""
+    place = root / "night" / "sources.json"
+    try:
+        found = unseal(place.read_bytes())
+        if found["code"] == code_digest() and set(found["sources"]) == set(NAMES):
+            _known.update(found["sources"])
+            return
+    except (OSError, BrokenSeal, KeyError, TypeError):
+        pass
+    if keep:
+        write_bytes(place, seal({"code": code_digest(), "sources": dict(sources())}), durable=False)
+    else:
+        sources()
