@@ -28,9 +28,10 @@ from fieldcal.logs.facts import Facts
 from fieldcal.logs.tidy import Disordered
 from fieldcal.names import Status, Verdict
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.stages.pipeline import INGEST, PIPELINE, Stage, run_stage
+from fieldcal.stages.pipeline import INGEST, PIPELINE
 from fieldcal.stages.results import StageResult, plain
 from fieldcal.stages.run_key import run_key
+from fieldcal.stages.stage import Stage, run_stage
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.files import file_sha256
 from fieldcal.warehouse.layout import signal_path

@@ -21,8 +21,9 @@ from fieldcal.logs import flight_id, ingest, log_format, log_sha256
 from fieldcal.logs.facts import Facts
 from fieldcal.names import SENSORS, Approach, Status, Verdict
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.stages.pipeline import INGEST, PIPELINE, run_stage
+from fieldcal.stages.pipeline import INGEST, PIPELINE
 from fieldcal.stages.results import StageResult, plain
+from fieldcal.stages.stage import run_stage
 from fieldcal.words.rows import rows_of, unfolded
 
 

@@ -13,7 +13,6 @@ Array = NDArray[np.floating[Any]]
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 """The quaternion of no rotation."""
-IDENTITY.flags.writeable = False
 
 
 def skew(v: ArrayLike) -> Array:

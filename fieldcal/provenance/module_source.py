@@ -112,6 +112,8 @@ def _statements(body: Sequence[ast.stmt]) -> Iterator[ast.stmt]:
     for node in body:
         if isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING"):
             yield from _statements(node.orelse)
+        elif isinstance(node, ast.If) and ast.unparse(node.test) in ("not TYPE_CHECKING", "not typing.TYPE_CHECKING"):
+            yield from _statements(node.body)
         elif not is_silent(node):
             yield node
 

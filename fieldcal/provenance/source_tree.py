@@ -46,31 +46,40 @@ class SourceTree:
     def modules(self) -> Iterator[str]:
         """Dotted names of all modules."""
         for path in files_below(self.folder):
-            if path.suffix == ".py":
-                parts = path.relative_to(self.folder).with_suffix("").parts
+            if path.name.endswith((".py", *importlib.machinery.EXTENSION_SUFFIXES)):
+                parts = path.relative_to(self.folder).with_name(path.name.split(".")[0]).parts
                 yield ".".join([self.package, *(parts[:-1] if parts[-1] == "__init__" else parts)])
 
     def places(self, path: str) -> list[Place]:
         """Everything a dotted path may stand for; an imported name leads on to where it is defined. None outside."""
         found: list[Place] = []
-        waiting, seen = [path], set()
+        first, *rest = path.split(".")
+        root = self.module(first)
+        waiting = [] if root is None else [(root, tuple(rest))]
+        seen: set[tuple[str, tuple[str, ...]]] = set()
         while waiting:
-            path = waiting.pop()
-            at, *rest = path.split(".")
-            if path in seen or (module := self.module(at)) is None:
+            module, names = waiting.pop()
+            if (module.name, names) in seen:
                 continue
-            seen.add(path)
-            while rest:
-                name, *rest = rest
-                waiting += [".".join([behind, *rest]) for behind in module.imported.get(name, ())]
-                inner = self.module(f"{module.name}.{name}")
-                if inner is None or name in {*module.definitions, *module.imported}:
-                    found.append(Place(module, name, bool(rest)))
-                if inner is None:
-                    break
-                module = inner
-            else:
+            seen.add((module.name, names))
+            if not names:
                 found.append(Place(module, None, False))
+                continue
+            name, *rest = names
+            within = f"{module.name}.{name}"
+            inner = self.module(within)
+            for behind in module.imported.get(name, ()):
+                if inner is not None and behind.startswith(f"{within}."):
+                    # A package takes a name from a module of that name, which the name then hides.
+                    waiting.append((inner, (*behind.removeprefix(f"{within}.").split("."), *rest)))
+                    continue
+                first, *further = behind.split(".")
+                if (other := self.module(first)) is not None:
+                    waiting.append((other, (*further, *rest)))
+            if inner is None or name in {*module.definitions, *module.imported}:
+                found.append(Place(module, name, bool(rest)))
+            if inner is not None:
+                waiting.append((inner, tuple(rest)))
         return found
 
     def runs_own_code(self, call: str) -> bool:

@@ -27,8 +27,11 @@ def is_silent(node: object) -> bool:
 
 
 def _write(value: object, out: list[str], *, late: bool, in_class: bool) -> None:
+    if late and not in_class and isinstance(value, ast.AnnAssign) and value.value is not None:
+        value = ast.Assign(targets=[value.target], value=value.value)
     if isinstance(value, ast.AST):
-        within = isinstance(value, ast.ClassDef) or (in_class and not isinstance(value, ast.FunctionDef | ast.Lambda))
+        functions = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
+        within = isinstance(value, ast.ClassDef) or (in_class and not isinstance(value, functions))
         out.append(f"{type(value).__name__}(")
         for name in value._fields:
             if late and _is_late(value, name, in_class=in_class):

@@ -90,6 +90,7 @@ class _Uses(ast.NodeVisitor):
         self._late = late
         self._scopes: list[Mapping[str, Paths]] = []
         """Of the functions around, what each name stands for; classes have none that their methods see."""
+        self._in_class = False
 
     def visit_Name(self, node: ast.Name) -> None:
         self._use(node.id, [])
@@ -117,9 +118,11 @@ class _Uses(ast.NodeVisitor):
         self._arguments(node.args)
         if node.returns is not None and not self._late:
             self.visit(node.returns)
-        self._scopes.append({**bound_names(node.body, self._package), **_parameters(node.args)})
+        outer, self._in_class = self._in_class, False
+        self._scopes.append({**_parameters(node.args), **bound_names(node.body, self._package)})
         self._all(node.body)
         self._scopes.pop()
+        self._in_class = outer
 
     visit_AsyncFunctionDef = visit_FunctionDef
 
@@ -135,8 +138,6 @@ class _Uses(ast.NodeVisitor):
             self.visit(node.value)
         if not self._late or self._in_class:
             self.visit(node.annotation)
-
-    _in_class = False
 
     def visit_ClassDef(self, node: ast.ClassDef) -> None:
         self._all([*node.decorator_list, *node.bases, *node.keywords])

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
-from fieldcal.config.stage_settings import AttitudeSettings, Axes, BodyVectors, LoggedValues, VectorConstants
 from fieldcal.estimation import wahba
 from fieldcal.estimation.faults import Fault
 from fieldcal.geometry import sensor_model
@@ -17,6 +17,9 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables, spread_of
 from fieldcal.stages.results import StageResult, fault_rows
 from fieldcal.stages.tables import QUATERNION, columns_of, constants, matrix, triad
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import AttitudeSettings, Axes, BodyVectors, LoggedValues, VectorConstants
 
 # Trust in an attitude halves where the sensed length is off by this share of the field.
 TRUST_ACCELERATION, TRUST_FIELD = 0.01, 0.01

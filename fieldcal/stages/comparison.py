@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 
-from fieldcal.config.stage_settings import Axes, SmoothingSettings, VerifySettings
 from fieldcal.estimation import smoothing, wahba
 from fieldcal.estimation.gyroscope.equation_error import predicted_quaternion_rate
 from fieldcal.estimation.gyroscope.output_error import propagate_stretches, shooting_segments, start_stretches
@@ -23,6 +22,9 @@ from fieldcal.stages.inputs import Tables, differentiate_by_segment, spread_of
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import QUATERNION, constants, matrix, seconds, triad
 from fieldcal.stages.vps import BRIDGE_S, RATE_COLUMNS, bridged, interpolate_attitude
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import Axes, SmoothingSettings, VerifySettings
 
 HELD_OUT_STRETCH_S = 10.0
 

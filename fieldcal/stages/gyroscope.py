@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 
-from fieldcal.config.stage_settings import (
-    GyroEquationPass2Settings,
-    GyroEquationSettings,
-    GyroOutputSettings,
-    GyroSettings,
-    LoggedValues,
-    TriadUncertainty,
-)
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation.gyroscope import equation_error, output_error
 from fieldcal.estimation.gyroscope.equation_error import GyroFit
@@ -47,6 +39,16 @@ from fieldcal.stages.tables import (
     seconds,
     triad,
 )
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import (
+        GyroEquationPass2Settings,
+        GyroEquationSettings,
+        GyroOutputSettings,
+        GyroSettings,
+        LoggedValues,
+        TriadUncertainty,
+    )
 
 MAX_MEDIAN_ATTITUDE_ERROR_RAD = 0.35
 

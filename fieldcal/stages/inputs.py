@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 
-from fieldcal.config.stage_settings import ReferenceReading
 from fieldcal.errors import FieldcalError
 from fieldcal.estimation import smoothing
 from fieldcal.estimation.segments import run_bounds
@@ -18,6 +17,9 @@ from fieldcal.geometry.sensor_model import default_reference_reading
 from fieldcal.names import Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.results import StageResult, fatal_fault
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import ReferenceReading
 
 Tables = Mapping[str, pl.DataFrame]
 

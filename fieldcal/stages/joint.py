@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import ArrayLike
 
-from fieldcal.config.stage_settings import JointSettings
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation.joint import initialise, model_selection
 from fieldcal.estimation.joint.covariance import advice
@@ -36,6 +35,9 @@ from fieldcal.stages.tables import (
     seconds,
     triad,
 )
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import JointSettings
 
 SERIAL_METHODS: dict[Sensor, tuple[Method | None, ...]] = {
     Sensor.MAGNETOMETER: (None,),

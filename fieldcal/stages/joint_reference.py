@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fieldcal.config.stage_settings import VpsReference
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation.clock_sync import by_rates
 from fieldcal.estimation.joint.fit import JointFit, fit_joint
@@ -19,6 +18,9 @@ from fieldcal.stages.attitude import sensor_attitude
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.tables import QUATERNION, matrix, seconds
 from fieldcal.stages.vps import vps_attitude
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import VpsReference
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 
-from fieldcal.config.stage_settings import VectorsSettings
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation import ellipsoid, motor_field
 from fieldcal.estimation.faults import Fault
@@ -20,6 +19,9 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables, in_used_segments
 from fieldcal.stages.results import fatal_fault
 from fieldcal.stages.tables import constants, matrix, triad
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import VectorsSettings
 
 PAUSE_S = 1.0
 PAUSE = 5.0

@@ -7,8 +7,6 @@ memory; the night walks the same tuple through its cache.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
 
 import polars as pl
 
@@ -26,39 +24,16 @@ from fieldcal.config.stage_settings import (
     S,
     SanitySettings,
     SmoothingSettings,
-    StageSettings,
     VectorsSettings,
     VerifySettings,
     VpsSyncSettings,
     WarmUpSettings,
-    names_of,
-    taken_from,
 )
-from fieldcal.names import VECTOR_SENSORS, Sensor, Status
-from fieldcal.reason_codes import ReasonCode
-from fieldcal.schemas import SchemaMismatch, conform
+from fieldcal.names import VECTOR_SENSORS, Sensor
 from fieldcal.stages import attitude, comparison, gyroscope, joint, preparation, sanity, vector_triads, vps, warm_up
 from fieldcal.stages.inputs import Tables
-from fieldcal.stages.results import StageResult, fatal_fault
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One stage: `takes` is its part of the flight's settings, `reads` maps the function's own names to `stage.table`,
-    `needs` are those it cannot do without, `trusts` the sensors that must be free of fatal faults."""
-
-    name: str
-    function: Callable[[Tables, Any], StageResult]
-    takes: type[StageSettings]
-    reads: Mapping[str, str]
-    needs: tuple[str, ...]
-    writes: tuple[str, ...]
-    trusts: tuple[Sensor, ...]
-
-    @property
-    def settings(self) -> tuple[str, ...]:
-        """Names of the settings that enter its run key."""
-        return names_of(self.takes)
+from fieldcal.stages.results import StageResult
+from fieldcal.stages.stage import Stage, run_stage
 
 
 def _stage(
@@ -77,8 +52,13 @@ def _stage(
 INGEST = "ingest"
 
 FAULTS = {"faults": "sanity.faults"}
-SAMPLES = {"samples": "smoothing.samples", "temperature": "ingest.temperature", **FAULTS}
-MAGNETOMETER = {"magnetometer": "magnetometer.calibration", "magnetometer_covariance": "magnetometer.covariance"}
+SAMPLES = {"samples": "smoothing.samples"}
+TRIAD = {**SAMPLES, "temperature": "ingest.temperature", **FAULTS}
+MAGNETOMETER = {"magnetometer": "magnetometer.calibration"}
+COVARIANCES = {
+    "magnetometer_covariance": "magnetometer.covariance",
+    "accelerometer_covariance": "accelerometer_pass2.covariance",
+}
 
 PIPELINE: tuple[Stage, ...] = (
     _stage(
@@ -109,7 +89,7 @@ PIPELINE: tuple[Stage, ...] = (
         "magnetometer",
         vector_triads.calibrate_magnetometer,
         MagnetometerSettings,
-        {**SAMPLES, "magnetometer": "ingest.magnetometer", "segments": "manoeuvre.segments"},
+        {**TRIAD, "magnetometer": "ingest.magnetometer", "segments": "manoeuvre.segments"},
         ("samples", "segments"),
         ("calibration", "covariance"),
         (Sensor.MAGNETOMETER,),
@@ -118,7 +98,7 @@ PIPELINE: tuple[Stage, ...] = (
         "accelerometer",
         vector_triads.calibrate_accelerometer,
         AccelerometerSettings,
-        SAMPLES,
+        TRIAD,
         ("samples",),
         ("calibration", "covariance"),
         (Sensor.ACCELEROMETER,),
@@ -127,7 +107,7 @@ PIPELINE: tuple[Stage, ...] = (
         "attitude",
         attitude.estimate_attitude,
         AttitudeSettings,
-        {**SAMPLES, **MAGNETOMETER, "accelerometer": "accelerometer.calibration"},
+        {**SAMPLES, **FAULTS, **MAGNETOMETER, "accelerometer": "accelerometer.calibration"},
         ("samples",),
         ("attitude", "faults"),
         VECTOR_SENSORS,
@@ -136,7 +116,7 @@ PIPELINE: tuple[Stage, ...] = (
         "gyro_equation",
         gyroscope.calibrate_gyro_equation,
         GyroEquationSettings,
-        {**SAMPLES, "attitude": "attitude.attitude"},
+        {**TRIAD, "attitude": "attitude.attitude"},
         ("samples", "attitude"),
         ("calibration", "covariance"),
         (Sensor.GYROSCOPE,),
@@ -147,7 +127,7 @@ PIPELINE: tuple[Stage, ...] = (
         vector_triads.calibrate_accelerometer_gated,
         GatedAccelerometerSettings,
         {
-            **SAMPLES,
+            **TRIAD,
             "accelerometer": "accelerometer.calibration",
             "gyroscope": "gyro_equation.calibration",
         },
@@ -159,7 +139,7 @@ PIPELINE: tuple[Stage, ...] = (
         "attitude_pass2",
         attitude.estimate_attitude,
         AttitudeSettings,
-        {**SAMPLES, **MAGNETOMETER, "accelerometer": "accelerometer_pass2.calibration"},
+        {**SAMPLES, **FAULTS, **MAGNETOMETER, "accelerometer": "accelerometer_pass2.calibration"},
         ("samples",),
         ("attitude", "faults"),
         VECTOR_SENSORS,
@@ -185,10 +165,10 @@ PIPELINE: tuple[Stage, ...] = (
         gyroscope.calibrate_gyro_equation_pass2,
         GyroEquationPass2Settings,
         {
-            **SAMPLES,
+            **TRIAD,
             **MAGNETOMETER,
             "accelerometer": "accelerometer_pass2.calibration",
-            "accelerometer_covariance": "accelerometer_pass2.covariance",
+            **COVARIANCES,
             "attitude": "attitude_pass2.attitude",
             "attitude_faults": "vectors.faults",
         },
@@ -201,10 +181,10 @@ PIPELINE: tuple[Stage, ...] = (
         gyroscope.calibrate_gyro_output,
         GyroOutputSettings,
         {
-            **SAMPLES,
+            **TRIAD,
             **MAGNETOMETER,
             "accelerometer": "accelerometer_pass2.calibration",
-            "accelerometer_covariance": "accelerometer_pass2.covariance",
+            **COVARIANCES,
             "attitude": "attitude_pass2.attitude",
             "gyroscope": "gyro_equation_pass2.calibration",
         },
@@ -231,7 +211,7 @@ PIPELINE: tuple[Stage, ...] = (
         joint.estimate_jointly,
         JointSettings,
         {
-            **SAMPLES,
+            **TRIAD,
             "imu": "ingest.imu",
             "vps": "ingest.vps",
             "magnetometer_log": "ingest.magnetometer",
@@ -293,47 +273,6 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
     "fit": ("verify.fit",),
     "sync": ("vps_sync.sync",),
 }
-
-
-def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: FlightSettings) -> StageResult:
-    """Run one stage on `stage.table` tables; missing needs end as a refusal that names them."""
-    inputs = {own: tables[name] for own, name in stage.reads.items() if name in tables}
-    result = refused_beforehand(stage, inputs)
-    if result is None:
-        result = stage.function(inputs, taken_from(settings, stage.takes))
-        _check_written(stage, result)
-    return result
-
-
-def refused_beforehand(stage: Stage, inputs: Mapping[str, pl.DataFrame]) -> StageResult | None:
-    """The refusal of a stage that is not to run on these inputs: a sensor is faulty, or something needed is missing."""
-    # An attitude is as good as the vectors that it came from.
-    for faults, sensors in (("faults", stage.trusts), ("attitude_faults", VECTOR_SENSORS)):
-        fault = fatal_fault(inputs[faults], sensors) if faults in inputs else None
-        if fault is not None:
-            return StageResult(
-                status=Status.REFUSED,
-                reason_code=ReasonCode(fault["reason_code"]),
-                reason=str(fault["reason"]),
-                measured={"number": fault["number"], "limit": fault["limit"]},
-            )
-    for need in stage.needs:
-        if need not in inputs:
-            source = stage.reads[need].split(".")[0]
-            return StageResult(
-                status=Status.REFUSED,
-                reason_code=ReasonCode(f"no_{need}"),
-                reason=f"{stage.name} needs {stage.reads[need]}, which {source} could not give.",
-            )
-    return None
-
-
-def _check_written(stage: Stage, result: StageResult) -> None:
-    """Raise `SchemaMismatch` unless what a stage wrote is what it declares, by the tables' schemas."""
-    if undeclared := sorted(set(result.tables) - set(stage.writes)):
-        raise SchemaMismatch(f"stage {stage.name} wrote {', '.join(undeclared)}, which it does not declare")
-    for name, frame in result.tables.items():
-        conform(frame.to_arrow(), name, stage=True)
 
 
 def run_flight(signals: Mapping[str, pl.DataFrame], settings: FlightSettings) -> dict[str, StageResult]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 
-from fieldcal.config.stage_settings import ManoeuvreSettings, SmoothingSettings
 from fieldcal.estimation import motion_selection, smoothing
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.geometry.intervals import interval_of
@@ -17,6 +16,9 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import columns_of, matrix, seconds, triad
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import ManoeuvreSettings, SmoothingSettings
 
 SHORTEST_STRETCH = 10
 MAGNETOMETER_PAUSE_S = 0.1

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from fieldcal.config.stage_settings import SanitySettings
 from fieldcal.estimation import faults
 from fieldcal.estimation.faults import Fault
 from fieldcal.geometry.earth_field import UNIT_IN_TESLA
@@ -14,6 +15,9 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.results import StageResult, fault_rows
 from fieldcal.stages.tables import matrix, seconds, triad
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import SanitySettings
 
 TABLE_OF = {Sensor.GYROSCOPE: "imu", Sensor.ACCELEROMETER: "imu", Sensor.MAGNETOMETER: "magnetometer"}
 """In the order in which faults are told."""

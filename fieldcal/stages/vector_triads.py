@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 
-from fieldcal.config.stage_settings import (
-    AccelerometerSettings,
-    EllipsoidSettings,
-    GatedAccelerometerSettings,
-    MagnetometerSettings,
-    VectorsSettings,
-)
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation import ellipsoid, motion_selection
 from fieldcal.estimation.ellipsoid import TriadFit
@@ -34,6 +27,15 @@ from fieldcal.stages.inputs import (
 from fieldcal.stages.motor_field import check_motor_field
 from fieldcal.stages.results import StageResult, fatal_fault, fault_rows, triad_rows
 from fieldcal.stages.tables import calibration_rows, constants, covariance_table, matrix, seconds, triad
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import (
+        AccelerometerSettings,
+        EllipsoidSettings,
+        GatedAccelerometerSettings,
+        MagnetometerSettings,
+        VectorsSettings,
+    )
 
 ELLIPSOID_METHOD: dict[EllipsoidFit, Method] = {
     "robust": Method.ELLIPSOID_ROBUST,

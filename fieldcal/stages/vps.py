@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 
-from fieldcal.config.stage_settings import LoggedValues, VpsAttitude, VpsClock, VpsSyncSettings
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation import smoothing
 from fieldcal.estimation.clock_sync import by_rates
@@ -34,6 +33,9 @@ from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Tables, is_sound
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, constants, matrix, seconds, triad
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import LoggedValues, VpsAttitude, VpsClock, VpsSyncSettings
 
 BRIDGE_S = 0.1  # IMU results are interpolated to VPS stamps only between samples this close
 

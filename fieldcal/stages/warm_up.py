@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fieldcal.config.stage_settings import WarmUpSettings
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation import warm_up
 from fieldcal.geometry.rotation import Array
@@ -15,6 +14,9 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables, is_sound
 from fieldcal.stages.results import ZERO_SLOPE, StageResult, zero_slope_rows
 from fieldcal.stages.tables import calibration_rows, constants, matrix, seconds, triad
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import WarmUpSettings
 
 METHOD, PARAMETER = Method.WARM_UP, ZERO_SLOPE
 CURVE = "zero_over_temperature"

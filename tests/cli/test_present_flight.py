@@ -10,7 +10,8 @@ import pytest
 from rich.console import Console
 
 from fieldcal.cli.present_flight import fit_table, print_refusals
-from fieldcal.stages.pipeline import PIPELINE, run_stage
+from fieldcal.stages.pipeline import PIPELINE
+from fieldcal.stages.stage import run_stage
 from fieldcal.words.flights import advised, is_consequence
 
 

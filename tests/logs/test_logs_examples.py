@@ -17,7 +17,8 @@ from fieldcal.config.configuration import Configuration, load
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs import find_logs, open_log, read_log
 from fieldcal.logs.ingest import read_flight, settings_of
-from fieldcal.stages.pipeline import PIPELINE, run_stage
+from fieldcal.stages.pipeline import PIPELINE
+from fieldcal.stages.stage import run_stage
 
 pytestmark = needs_examples
 TABLES = {"/imu/data_raw": "imu", "/imu/mag": "magnetometer", "/vps/pose": "vps"}

@@ -3,141 +3,36 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import os
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
 from fieldcal.config.configuration import load
+from fieldcal.provenance.source_tree import SourceTree
 from fieldcal.stages import run_key
 from fieldcal.stages.run_key import source_digest
 
-STAGES = '''
-"""Stages."""
-from toy import alpha
-from toy.beta import LIMIT
-import toy.gamma
 
-SHARED = 3
+def test_wrapped_and_partial_functions_are_seen_through() -> None:
+    @functools.wraps(load)
+    def wrapped(path: Path | None) -> Any:
+        return load(path)
 
-def helper(x):
-    return x + SHARED
-
-def first(x):
-    """Uses alpha and the helper."""
-    return alpha.double(helper(x))
-
-def second(x):
-    from toy.delta import late
-    return late(x) + LIMIT
-
-def third(x):
-    return toy.gamma.f(x)
-
-def fourth(x):
-    return x
-'''
-FILES = {
-    "__init__": "",
-    "stages": STAGES,
-    "alpha": "from toy import deep\ndef double(x):\n    return deep.twice(x)\n",
-    "deep": "def twice(x):\n    return 2 * x\n",
-    "beta": "LIMIT = 4\n",
-    "gamma": "from . import deep\nfrom .inner import thing\ndef f(x):\n    return x\n",
-    "inner/__init__": "from .leaf import thing\n",
-    "inner/leaf": "thing = 1\n",
-    "delta": "def late(x):\n    return x\n",
-    "report": "def page():\n    return ''\n",
-}
+    assert source_digest(wrapped) == source_digest(load)
+    assert source_digest(functools.partial(load, None)) == source_digest(load)
+    assert source_digest(run_key.run_key) != source_digest(load)
+    assert source_digest(load, run_key.run_key) == source_digest(run_key.run_key, load)
 
 
-@pytest.fixture
-def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A project package `toy` that provenance takes for its own."""
-    for name, text in FILES.items():
-        path = tmp_path / "toy" / f"{name}.py"
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(text)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(run_key, "PROJECT", ("toy",))
-    forget()
-    yield tmp_path / "toy"
-    for name in [name for name in sys.modules if name.split(".")[0] == "toy"]:
-        del sys.modules[name]
-    forget()
-
-
-def forget() -> None:
-    run_key._path.cache_clear()
-    run_key._package_folder.cache_clear()
-
-
-def stages() -> ModuleType:
-    return importlib.import_module("toy.stages")
-
-
-def keys() -> dict[str, str]:
-    return {name: run_key.source_digest(getattr(stages(), name)) for name in ("first", "second", "third", "fourth")}
-
-
-def edit(toy: Path, name: str, old: str, new: str) -> set[str]:
-    """Stages whose digest changes with this edit."""
-    before = keys()
-    path = toy / f"{name}.py"
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new))
-    os.utime(path, ns=(1, path.stat().st_mtime_ns + 1_000_000))
-    return {stage for stage, digest in keys().items() if digest != before[stage]}
-
-
-@pytest.mark.parametrize(
-    ("name", "old", "new", "changed"),
-    [
-        ("alpha", "deep.twice", "2 * deep.twice", {"first"}),
-        ("deep", "2 * x", "3 * x", {"first", "third"}),
-        ("beta", "4", "5", {"second"}),
-        ("delta", "return x", "return -x", {"second"}),
-        ("gamma", "return x", "return -x", {"third"}),
-        ("inner/leaf", "1", "2", {"third"}),
-        ("report", "''", "'x'", set()),
-        ("stages", "SHARED = 3", "SHARED = 4", {"first"}),
-        ("stages", "x + SHARED", "x - SHARED", {"first"}),
-        ("stages", "+ LIMIT", "- LIMIT", {"second"}),
-        ("stages", "    return x\n", "    return 2 * x\n", {"fourth"}),
-        ("stages", '"""Stages."""', '"""The stages."""', set()),
-        ("stages", "SHARED = 3", "SHARED = 3\nprint()", {"first", "second", "third", "fourth"}),
-    ],
-)
-def test_an_edit_concerns_the_stages_that_reach_it(toy: Path, name: str, old: str, new: str, changed: set[str]) -> None:
-    assert edit(toy, name, old, new) == changed
-
-
-def test_reached_modules_are_named(toy: Path) -> None:
-    assert toy.is_dir()
-    assert run_key.reached_modules(stages().first) == ("toy.alpha", "toy.deep")
-    assert run_key.reached_modules(stages().second) == ("toy.beta", "toy.delta")
-    assert run_key.reached_modules(stages().third) == ("toy.deep", "toy.gamma", "toy.inner", "toy.inner.leaf")
-    assert run_key.reached_modules(stages().fourth) == ()
-
-
-def test_wrapped_and_partial_functions_are_seen_through(toy: Path) -> None:
-    assert toy.is_dir()
-    first: Callable[[int], int] = stages().first
-
-    @functools.wraps(first)
-    def wrapped(x: int) -> int:
-        return first(x)
-
-    assert run_key.source_digest(wrapped) == run_key.source_digest(first)
-    assert run_key.source_digest(functools.partial(first, 1)) == run_key.source_digest(first)
-    assert run_key.source_digest(stages().helper) != run_key.source_digest(first)
+def test_a_function_of_no_top_level_has_no_digest() -> None:
+    with pytest.raises(LookupError, match="no definition of the source"):
+        source_digest(lambda: None)
 
 
 def test_every_part_of_the_key_counts() -> None:
@@ -152,9 +47,8 @@ def test_every_part_of_the_key_counts() -> None:
         run_key.run_key("s", source_digest(load), {"a": 1.0, "b": [2, 1]}, {"imu": "1", "vps": "2"}),
         run_key.run_key("s", source_digest(load), {"a": 1.0, "b": [1, 2]}, {"imu": "2", "vps": "1"}),
         run_key.run_key("s", source_digest(load), {"a": 1.0, "b": [1, 2]}, {"imu": "1"}),
-        run_key.run_key("s", source_digest(load), {"a": 1.0, "b": [1, 2]}, {"imu": "1", "vps": "2"}, extra={"x": 1}),
     }
-    assert len(different | {base}) == 8
+    assert len(different | {base}) == 7
 
 
 def test_versions_of_the_libraries_count(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,3 +82,21 @@ def test_the_key_is_the_same_in_every_process() -> None:
         for seed, zone in (("0", "UTC"), ("1", "Asia/Tokyo"))
     }
     assert len(found) == 1
+
+
+def test_the_digest_of_all_code_covers_every_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "part").mkdir()
+    for name in ("__init__.py", "part/view.sql", "part/kernel.so", "part/.hidden", "part/deep.py"):
+        (tmp_path / name).write_text("1")
+    monkeypatch.setattr(run_key, "installed", lambda package: SourceTree(package, tmp_path))
+
+    def after(name: str) -> str:
+        (tmp_path / name).write_text("2")
+        run_key.code_digest.cache_clear()
+        return run_key.code_digest()
+
+    run_key.code_digest.cache_clear()
+    digests = [run_key.code_digest(), *(after(name) for name in ("part/view.sql", "part/kernel.so", "part/deep.py"))]
+    assert len(set(digests)) == 4
+    assert after("part/.hidden") == digests[-1]
+    run_key.code_digest.cache_clear()

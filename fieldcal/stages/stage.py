@@ -1,0 +1,77 @@
+"""A stage: what it is, and how one runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import polars as pl
+
+from fieldcal.config.flight_settings import FlightSettings
+from fieldcal.config.stage_settings import StageSettings, names_of, taken_from
+from fieldcal.names import VECTOR_SENSORS, Sensor, Status
+from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas import SchemaMismatch, conform
+from fieldcal.stages.inputs import Tables
+from fieldcal.stages.results import StageResult, fatal_fault
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage: `takes` is its part of the flight's settings, `reads` maps the function's own names to `stage.table`,
+    `needs` are those it cannot do without, `trusts` the sensors that must be free of fatal faults."""
+
+    name: str
+    function: Callable[[Tables, Any], StageResult]
+    takes: type[StageSettings]
+    reads: Mapping[str, str]
+    needs: tuple[str, ...]
+    writes: tuple[str, ...]
+    trusts: tuple[Sensor, ...]
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """Names of the settings that enter its run key."""
+        return names_of(self.takes)
+
+
+def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: FlightSettings) -> StageResult:
+    """Run one stage on `stage.table` tables; missing needs end as a refusal that names them."""
+    inputs = {own: tables[name] for own, name in stage.reads.items() if name in tables}
+    result = refused_beforehand(stage, inputs)
+    if result is None:
+        result = stage.function(inputs, taken_from(settings, stage.takes))
+        _check_written(stage, result)
+    return result
+
+
+def refused_beforehand(stage: Stage, inputs: Mapping[str, pl.DataFrame]) -> StageResult | None:
+    """The refusal of a stage that is not to run on these inputs: a sensor is faulty, or something needed is missing."""
+    # An attitude is as good as the vectors that it came from.
+    for faults, sensors in (("faults", stage.trusts), ("attitude_faults", VECTOR_SENSORS)):
+        fault = fatal_fault(inputs[faults], sensors) if faults in inputs else None
+        if fault is not None:
+            return StageResult(
+                status=Status.REFUSED,
+                reason_code=ReasonCode(fault["reason_code"]),
+                reason=str(fault["reason"]),
+                measured={"number": fault["number"], "limit": fault["limit"]},
+            )
+    for need in stage.needs:
+        if need not in inputs:
+            source = stage.reads[need].split(".")[0]
+            return StageResult(
+                status=Status.REFUSED,
+                reason_code=ReasonCode(f"no_{need}"),
+                reason=f"{stage.name} needs {stage.reads[need]}, which {source} could not give.",
+            )
+    return None
+
+
+def _check_written(stage: Stage, result: StageResult) -> None:
+    """Raise `SchemaMismatch` unless what a stage wrote is what it declares, by the tables' schemas."""
+    if undeclared := sorted(set(result.tables) - set(stage.writes)):
+        raise SchemaMismatch(f"stage {stage.name} wrote {', '.join(undeclared)}, which it does not declare")
+    for name, frame in result.tables.items():
+        conform(frame.to_arrow(), name, stage=True)
