@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -25,16 +26,19 @@ BEFOREHAND = {"faults", "attitude_faults"}
 """Tables that `stage.refused_beforehand` reads for a stage."""
 
 
-class WatchedSettings:
-    """A stage's settings that note which are read."""
+def watched_settings(content: StageSettings, asked: set[str]) -> StageSettings:
+    """The same settings, which note in `asked` what is read of them; a copy with changes reads nothing."""
+    names = {field.name for field in fields(content)}
 
-    def __init__(self, content: StageSettings) -> None:
-        self._content = content
-        self.asked: set[str] = set()
+    class Watching(type(content)):  # type: ignore[misc]
+        def __getattribute__(self, name: str) -> Any:
+            if name in names and sys._getframe(1).f_globals["__name__"] != "dataclasses":
+                asked.add(name)
+            return super().__getattribute__(name)
 
-    def __getattr__(self, name: str) -> Any:
-        self.asked.add(name)
-        return getattr(self._content, name)
+    watching: StageSettings = object.__new__(Watching)
+    vars(watching).update(vars(content))
+    return watching
 
 
 class Watched(Mapping[str, Any]):
@@ -62,9 +66,10 @@ def fly(tables: Mapping[str, pl.DataFrame], chosen: FlightSettings) -> dict[str,
     for stage in PIPELINE:
 
         def watched(inputs: Any, values: Any, stage: Stage = stage) -> StageResult:
-            own, given = Watched(inputs), WatchedSettings(values)
-            result = stage.function(own, given)
-            asked[stage.name] = {f"table {name}" for name in own.asked} | {f"setting {name}" for name in given.asked}
+            read, settings_read = Watched(inputs), set[str]()
+            result = stage.function(read, watched_settings(values, settings_read))
+            tables_read = {f"table {name}" for name in read.asked}
+            asked[stage.name] = tables_read | {f"setting {name}" for name in settings_read}
             return result
 
         result = run_stage(replace(stage, function=watched), known, chosen)
