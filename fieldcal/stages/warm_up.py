@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from fieldcal.config.stage_settings import WarmUpSettings
@@ -14,7 +12,7 @@ from fieldcal.names import Method, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables, is_sound
 from fieldcal.stages.results import ZERO_SLOPE, StageResult, zero_slope_rows
-from fieldcal.stages.tables import calibration_rows, constants, matrix, seconds, triad
+from fieldcal.stages.tables import CalibrationRow, calibration_rows, constants, matrix, seconds, triad
 
 METHOD, PARAMETER = Method.WARM_UP, ZERO_SLOPE
 CURVE = "zero_over_temperature"
@@ -55,7 +53,7 @@ def find_warm_up(tables: Tables, s: WarmUpSettings) -> StageResult:
     return StageResult({"calibration": calibration_rows(rows)}, measured=measured)
 
 
-def _rows(sensor: Sensor, found: warm_up.WarmUp, s: WarmUpSettings) -> list[dict[str, Any]]:
+def _rows(sensor: Sensor, found: warm_up.WarmUp, s: WarmUpSettings) -> list[CalibrationRow]:
     return zero_slope_rows(
         sensor,
         METHOD,
