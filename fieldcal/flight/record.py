@@ -37,6 +37,15 @@ class StepRecord(TypedDict):
     run_key: str | None
 
 
+class Refusal(TypedDict):
+    """A step that refused or failed, with its code and sentence."""
+
+    stage: str
+    status: str
+    reason_code: str | None
+    reason: str | None
+
+
 class Record(StepRecord, total=False):
     """The same of a step of a night, with what its key is made of and the sha256 of all it wrote.
 
