@@ -8,6 +8,7 @@ from fieldcal.config.find import Source
 from fieldcal.flight.job import PlainJob
 from fieldcal.flight.record import Record, Refusal
 from fieldcal.logs.facts import FindingFacts
+from fieldcal.trends.changes import PlainChange
 
 
 class PlainOutcome(TypedDict):
@@ -55,18 +56,6 @@ class LogEntry(TypedDict):
     stages_cached: int
     ran: dict[str, str | None]
     copy_of: NotRequired[str]
-
-
-class PlainChange(TypedDict):
-    """A `fieldcal.trends.changes.Change`."""
-
-    kind: str
-    vehicle_id: str
-    imu_id: str | None
-    sensor: str | None
-    axis: str | None
-    parameters: list[str]
-    sentence: str
 
 
 class NightSummary(TypedDict):

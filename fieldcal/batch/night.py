@@ -10,7 +10,7 @@ from typing import Protocol, cast
 import polars as pl
 
 from fieldcal.batch.closing import Closing
-from fieldcal.batch.documents import NightDocument, PlainChange
+from fieldcal.batch.documents import NightDocument
 from fieldcal.batch.log_ledger import write_ledger
 from fieldcal.batch.outcome import Outcome, summary
 from fieldcal.batch.plan import Plan, make_plan
@@ -55,18 +55,7 @@ class Night:
 
     def document(self, outcomes: Sequence[Outcome], closing: Closing) -> NightDocument:
         """The JSON of the night, without how long it took."""
-        changes: list[PlainChange] = [
-            {
-                "kind": change.kind,
-                "vehicle_id": change.vehicle_id,
-                "imu_id": change.imu_id,
-                "sensor": change.sensor,
-                "axis": change.axis,
-                "parameters": list(change.parameters),
-                "sentence": change.sentence,
-            }
-            for change in closing.changes
-        ]
+        changes = [change.row() for change in closing.changes]
         told: dict[str, object] = dict(summary(outcomes, self.plan.copies, self.plan.copied, self.root))
         return cast(NightDocument, {**told, "changes": changes, "report": str(closing.report)})
 

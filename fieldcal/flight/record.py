@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NotRequired, TypedDict
 
 from fieldcal.logs.facts import Facts
+from fieldcal.names import Json
 
 
 class Output(TypedDict):
@@ -20,7 +22,7 @@ class Causes(TypedDict):
     """What the key of a step is made of."""
 
     run_key: str
-    params: dict[str, Any]
+    params: Mapping[str, Json]
     inputs: dict[str, str]
     source: str
     versions: dict[str, str]
@@ -52,7 +54,7 @@ class Record(StepRecord, total=False):
     `facts` and `signals` are of the step that reads the log. `unkept`: the next night tries again.
     """
 
-    params: dict[str, Any]
+    params: Mapping[str, Json]
     inputs: dict[str, str]
     source: str
     outputs: dict[str, Output]
