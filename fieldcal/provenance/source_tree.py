@@ -62,7 +62,13 @@ class SourceTree:
             seen.add(path)
             while rest:
                 name, *rest = rest
-                waiting += [".".join([behind, *rest]) for behind in module.imported.get(name, ())]
+                own = f"{module.name}.{name}."
+                # `from package.name import name` in the package itself: what goes on from there goes on in the module.
+                waiting += [
+                    ".".join([behind, *rest])
+                    for behind in module.imported.get(name, ())
+                    if not (rest and f"{behind}.".startswith(own))
+                ]
                 inner = self.module(f"{module.name}.{name}")
                 if inner is None or name in {*module.definitions, *module.imported}:
                     found.append(Place(module, name, bool(rest)))
