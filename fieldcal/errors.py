@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
 
 
@@ -34,11 +35,11 @@ class FieldcalError(Exception):
     not_found
     """
 
-    def __init__(self, reason_code: ReasonCode, sentence: str, measured: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, reason_code: ReasonCode, sentence: str, measured: Mapping[str, Json] | None = None) -> None:
         super().__init__(sentence)
         self.reason_code = reason_code
         self.sentence = sentence
-        self.measured: dict[str, Any] = dict(measured or {})
+        self.measured: dict[str, Json] = dict(measured or {})
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies whole, also between processes."""
@@ -57,6 +58,12 @@ class ConfigurationError(FieldcalError):
     ...     print(error)
     nowhere.toml: there is no such file.
     """
+
+    @property
+    def mistakes(self) -> list[str]:
+        """Every mistake that was found, each a sentence."""
+        told = self.measured.get("mistakes")
+        return [str(one) for one in told] if isinstance(told, list) else [self.sentence]
 
 
 class UnreadableLog(FieldcalError):

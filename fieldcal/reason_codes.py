@@ -314,6 +314,8 @@ class ReasonCode(StrEnum):
     """Too many files are open."""
     PLATFORM_NOT_SUPPORTED = "platform_not_supported"
     """The operating system lacks what is needed."""
+    CODE_CHANGED = "code_changed"
+    """The processes of a night run different code."""
     BATCH_LOST = "batch_lost"
     """A worker died with its flights."""
     NO_DASK = "no_dask"

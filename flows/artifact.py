@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from fieldcal.batch.documents import LogEntry, NightDocument
+from fieldcal.batch.outcome import verdict_counts
 from fieldcal.names import Verdict
 from fieldcal.trends.changes import Change
 
@@ -15,11 +17,11 @@ MOST_ROWS = 500
 EVENT = "fieldcal.fleet.changed"
 
 
-def keep_artifact(result: Mapping[str, Any], root: Path) -> None:
+def keep_artifact(result: NightDocument, root: Path) -> None:
     """Keep the logs that are not `ok` or refused something, under the night's counts. A lost server is no error."""
     from prefect.artifacts import create_table_artifact
 
-    counts = ", ".join(f"{result[verdict]} {verdict}" for verdict in Verdict)
+    counts = verdict_counts(result)
     news = [
         {"log": change["vehicle_id"], "what": change["kind"], "why": change["sentence"]} for change in result["changes"]
     ]
@@ -38,7 +40,7 @@ def keep_artifact(result: Mapping[str, Any], root: Path) -> None:
         say(f"Prefect keeps no table of this night ({type(error).__name__}); the warehouse has it all.")
 
 
-def _rows(log: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _rows(log: LogEntry) -> list[dict[str, Any]]:
     own = [] if log["verdict"] == Verdict.OK else [{"what": log["verdict"], "why": log["reason"] or log["reason_code"]}]
     refused = [{"what": f"{r['stage']} {r['status']}", "why": r["reason"] or r["reason_code"]} for r in log["refusals"]]
     return [{"log": log["log_uri"], **row} for row in own + refused]

@@ -6,21 +6,24 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from prefect import Flow, flow
 
 from fieldcal.batch.closing import close_night
+from fieldcal.batch.documents import Answer, Batch, NightDocument, PlainOutcome
 from fieldcal.batch.flights import flights, lost
 from fieldcal.batch.night import Night, Watcher, plan_night, publishings
 from fieldcal.batch.outcome import Outcome
 from fieldcal.config.find import Source
+from fieldcal.flight.job import PlainJob
 from fieldcal.flows.alive import alive
 from fieldcal.flows.artifact import keep_artifact, tell_prefect
 from fieldcal.flows.pool import hand_over, pool_answers
 from fieldcal.flows.processes import process_answers, spawned
 from fieldcal.flows.runners import Answers, Parallel, batches, dask_answers
 from fieldcal.flows.tasks import run_batch, run_publish, unseen
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.run_key import code_digest
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.words.talk import say
@@ -34,7 +37,7 @@ def nightly(
     workers: int = 1,
     runner: str = "process",
     scheduler: str | None = None,
-) -> dict[str, Any]:
+) -> NightDocument:
     """Calibrate every log of `archive` that is new or changed, and publish.
 
     Parameters
@@ -66,7 +69,7 @@ def session(
     workers: int = 1,
     runner: str = "process",
     scheduler: str | None = None,
-) -> dict[str, Any]:
+) -> NightDocument:
     """The same for the one session folder `<archive>/<vehicle>/<session>`."""
     place = Path(folder)
     night = plan_night(place.parent.parent, Path(warehouse), Path(config) if config else None, place)
@@ -77,16 +80,16 @@ def session(
 def batch(number: int, root: str, source: Source, jobs: list[dict[str, Any]], code: str, handed_over: str) -> None:
     """A batch in a flow run of its own, in a work pool; its answer is handed over as a file of the warehouse."""
     with alive(Path(root)):
-        hand_over(Path(root), handed_over, run_batch(number, root, source, jobs, code))
+        hand_over(Path(root), handed_over, run_batch(number, root, source, cast(list[PlainJob], jobs), code))
 
 
 def flow_of(
     night: Night, parallel: Parallel, watcher: Watcher | None, processes: ProcessPoolExecutor | None
-) -> Flow[..., dict[str, Any]]:
+) -> Flow[..., NightDocument]:
     """The flow of a night that was planned already, while the server started; `processes` wait for its batches."""
 
     @flow(name="nightly" if night.session is None else "session", persist_result=False, validate_parameters=False)
-    def planned(folder: str, warehouse: str, workers: int, runner: str) -> dict[str, Any]:
+    def planned(folder: str, warehouse: str, workers: int, runner: str) -> NightDocument:
         return carry_out(night, parallel, watcher, processes)
 
     return planned
@@ -97,7 +100,7 @@ def carry_out(
     parallel: Parallel,
     watcher: Watcher | None = None,
     processes: ProcessPoolExecutor | None = None,
-) -> dict[str, Any]:
+) -> NightDocument:
     """Run what the plan says, within a flow run; the JSON of the night."""
     with alive(night.root):
         if watcher is not None:
@@ -122,7 +125,7 @@ def _calibrate(
 ) -> Iterator[Outcome]:
     """Outcomes of the flights with something missing, batch by batch."""
     root, code = str(night.root), code_digest()
-    inputs: list[dict[str, Any]] = [
+    inputs: list[Batch] = [
         {"number": n, "root": root, "source": night.source, "jobs": [job.plain() for job in jobs], "code": code}
         for n, jobs in enumerate(batches(night.missing(), parallel.workers))
     ]
@@ -140,7 +143,7 @@ def _calibrate(
             yield outcome
 
 
-def _answers(parallel: Parallel, inputs: list[dict[str, Any]], processes: ProcessPoolExecutor | None) -> Answers:
+def _answers(parallel: Parallel, inputs: list[Batch], processes: ProcessPoolExecutor | None) -> Answers:
     if parallel.runner == "pool":
         return pool_answers(inputs)
     if parallel.runner == "dask":
@@ -148,15 +151,16 @@ def _answers(parallel: Parallel, inputs: list[dict[str, Any]], processes: Proces
     return process_answers(processes or spawned(parallel.workers), inputs)
 
 
-def _outcomes(answer: dict[str, Any]) -> Iterator[Outcome]:
+def _outcomes(answer: Answer) -> Iterator[Outcome]:
     yield from (Outcome.of(plain) for plain in answer["outcomes"])
     if answer["error"] is not None:
-        raise WarehouseError(*answer["error"])
+        reason_code, sentence = answer["error"]
+        raise WarehouseError(ReasonCode(reason_code), sentence)
 
 
-def _one_by_one(given: dict[str, Any]) -> dict[str, Any]:
+def _one_by_one(given: Batch) -> Answer:
     """The flights of a batch whose process died, each in a process of its own: only the guilty one is lost."""
-    outcomes: list[dict[str, Any]] = []
+    outcomes: list[PlainOutcome] = []
     for job in given["jobs"]:
         with spawned(1) as alone:
             try:

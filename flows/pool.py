@@ -7,11 +7,12 @@ would store it with a serialiser that the reader does not choose.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from uuid import uuid4
 
+from fieldcal.batch.documents import Answer, Batch
 from fieldcal.errors import FieldcalError
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse.files import write_bytes
@@ -21,12 +22,12 @@ BATCH_DEPLOYMENT = "batch/fieldcal"
 LOOK_EVERY_S = 1.0
 
 
-def hand_over(root: Path, name: str, answer: Mapping[str, Any]) -> None:
+def hand_over(root: Path, name: str, answer: Answer) -> None:
     """Keep the answer of a batch for the night that asked."""
     write_bytes(_place(root, name), seal(answer), durable=False)
 
 
-def pool_answers(inputs: Sequence[dict[str, Any]]) -> Iterator[tuple[dict[str, Any], dict[str, Any] | Exception]]:
+def pool_answers(inputs: Sequence[Batch]) -> Iterator[tuple[Batch, Answer | Exception]]:
     """Run the batches in the work pool; each with its answer, in the order in which they end.
 
     Raises
@@ -43,7 +44,7 @@ def pool_answers(inputs: Sequence[dict[str, Any]]) -> Iterator[tuple[dict[str, A
         except ObjectNotFound as error:
             what = f"The server has no deployment {BATCH_DEPLOYMENT}: run `prefect deploy --all` (prefect.yaml)."
             raise FieldcalError(ReasonCode.NO_DEPLOYMENT, what) from error
-        waiting: dict[Any, tuple[dict[str, Any], str]] = {}
+        waiting: dict[Any, tuple[Batch, str]] = {}
         for given in inputs:
             name = uuid4().hex
             run = client.create_flow_run_from_deployment(deployment.id, parameters={**given, "handed_over": name})
@@ -57,10 +58,10 @@ def pool_answers(inputs: Sequence[dict[str, Any]]) -> Iterator[tuple[dict[str, A
             time.sleep(LOOK_EVERY_S)
 
 
-def _taken(root: Path, name: str, state: str | None) -> dict[str, Any] | Exception:
+def _taken(root: Path, name: str, state: str | None) -> Answer | Exception:
     place = _place(root, name)
     try:
-        answer = unseal(place.read_bytes())
+        answer = cast(Answer, unseal(place.read_bytes()))
     except (OSError, BrokenSeal):
         return FieldcalError(ReasonCode.BATCH_LOST, f"its flow run ended as {state} and left no answer")
     place.unlink(missing_ok=True)

@@ -12,6 +12,7 @@ from importlib import import_module
 from multiprocessing import get_context
 from typing import Any
 
+from fieldcal.batch.documents import Answer, Batch
 from fieldcal.flows.runners import Answers, answer_of
 
 LISTEN_S = 0.25
@@ -30,11 +31,11 @@ def spawned_ahead(workers: int) -> ProcessPoolExecutor:
     return pool
 
 
-def process_answers(pool: ProcessPoolExecutor, inputs: Sequence[dict[str, Any]]) -> Answers:
+def process_answers(pool: ProcessPoolExecutor, inputs: Sequence[Batch]) -> Answers:
     """Run the batches; call it within the flow run that their tasks belong to."""
     context = _context()
     with pool:
-        waiting: dict[Future[dict[str, Any]], dict[str, Any]] = {}
+        waiting: dict[Future[Answer], Batch] = {}
         waiting |= {pool.submit(_batch, context, given): given for given in inputs}
         while waiting:
             # A wait without end would not hear Ctrl-C.
@@ -56,7 +57,7 @@ def _import() -> None:
     import_module("fieldcal.flows.nightly")
 
 
-def _batch(context: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+def _batch(context: dict[str, Any], given: Batch) -> Answer:
     """One batch, in one of the processes."""
     from prefect.context import hydrated_context
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, cast
 
+from fieldcal.batch.documents import NightDocument, PlanDocument, PlannedLog
 from fieldcal.config.find import configuration_of, find_source
 from fieldcal.flows.server import running_server
 from fieldcal.warehouse.layout import prepare
@@ -23,7 +24,7 @@ def run_night(
     workers: int = 1,
     progress: Watcher | None = None,
     **where: str | None,
-) -> dict[str, Any]:
+) -> NightDocument:
     """Run the flow `nightly`, or `session` for that folder of the archive; its JSON, with how long it took.
 
     `where` may hold `runner` and `scheduler` (`runners`). `seconds` is the whole duration, `server_seconds` what
@@ -56,17 +57,18 @@ def run_night(
             with temporary_settings({PREFECT_API_URL: url}):
                 planned = flow_of(night, parallel, progress, processes)
                 result = planned(str(session or archive), str(root), workers, runner)
-    logs = result.pop("logs")
-    times = {"seconds": round(time.monotonic() - began, 3), "server_seconds": round(start_s, 3)}
-    return {**result, **times, "logs": logs}
+    told: dict[str, object] = dict(result)
+    logs = told.pop("logs")
+    told |= {"seconds": round(time.monotonic() - began, 3), "server_seconds": round(start_s, 3)}
+    return cast(NightDocument, {**told, "logs": logs})
 
 
-def dry_run(archive: Path, root: Path, config: Path | None, session: Path | None) -> dict[str, Any]:
+def dry_run(archive: Path, root: Path, config: Path | None, session: Path | None) -> PlanDocument:
     """What the night would run; changes nothing."""
     from fieldcal.batch.plan import make_plan
 
     plan = make_plan(root, archive, configuration_of(find_source(config, archive)), session)
-    logs: list[dict[str, Any]] = [
+    logs: list[PlannedLog] = [
         {
             "log_uri": job.log_uri,
             "flight_id": job.flight_id,

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from fieldcal.batch.documents import Answer, Batch
 from fieldcal.errors import FieldcalError
 from fieldcal.flight.job import Job
 from fieldcal.reason_codes import ReasonCode
@@ -61,11 +62,11 @@ def batches(jobs: Sequence[Job], workers: int) -> list[list[Job]]:
     return dealt
 
 
-Answers = Iterator[tuple[dict[str, Any], dict[str, Any] | Exception]]
+Answers = Iterator[tuple[Batch, Answer | Exception]]
 """Each input with what came back, in the order in which they end."""
 
 
-def dask_answers(parallel: Parallel, task: Task[Any, dict[str, Any]], inputs: Sequence[dict[str, Any]]) -> Answers:
+def dask_answers(parallel: Parallel, task: Task[Any, Answer], inputs: Sequence[Batch]) -> Answers:
     """Run `task` on a Dask cluster: the one of the scheduler, or one of this machine.
 
     Raises
@@ -76,15 +77,15 @@ def dask_answers(parallel: Parallel, task: Task[Any, dict[str, Any]], inputs: Se
     from prefect.futures import as_completed
 
     with _dask(parallel) as runner:
-        waiting = {runner.submit(task, given): given for given in inputs}
+        waiting = {runner.submit(task, dict(given)): given for given in inputs}
         for future in as_completed(list(waiting)):
             yield waiting[future], answer_of(future)
 
 
-def answer_of(future: Any) -> dict[str, Any] | Exception:
+def answer_of(future: Any) -> Answer | Exception:
     """What a finished batch came back with."""
     try:
-        answer: dict[str, Any] = future.result()
+        answer: Answer = future.result()
     except Exception as error:
         return error
     return answer

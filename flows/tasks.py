@@ -15,10 +15,12 @@ from prefect.client.schemas.objects import State, StateDetails
 from prefect.states import Completed
 from prefect.utilities.annotations import quote
 
+from fieldcal.batch.documents import Answer
 from fieldcal.batch.flights import flights
 from fieldcal.batch.night import Publishing, Watcher
 from fieldcal.batch.steps import FlightWork
 from fieldcal.config.find import Source
+from fieldcal.flight.job import PlainJob
 from fieldcal.warehouse.errors import WarehouseError
 
 T = TypeVar("T")
@@ -43,8 +45,8 @@ def run_step(work: FlightWork, step: str, log_uri: str) -> State[Any]:
 
 @task(name="batch", task_run_name="batch {number}", cache_policy=NO_CACHE, persist_result=False)
 def run_batch(
-    number: int, root: str, source: Source, jobs: list[dict[str, Any]], code: str, watcher: Watcher | None = None
-) -> dict[str, Any]:
+    number: int, root: str, source: Source, jobs: list[PlainJob], code: str, watcher: Watcher | None = None
+) -> Answer:
     """A batch of flights, every step a task (`fieldcal.batch.flights.flights`)."""
     return flights(root, source, jobs, code, do=step_as_task, tell=None if watcher is None else watcher.done)
 

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
+from fieldcal.batch.documents import Answer, PlainOutcome
 from fieldcal.batch.outcome import Outcome, failed_outcome
 from fieldcal.batch.sources import know_sources
 from fieldcal.batch.steps import STEPS, FlightWork
 from fieldcal.config.configuration import Configuration
 from fieldcal.config.find import Source, configuration_of
 from fieldcal.errors import unforeseen
-from fieldcal.flight.job import Job
+from fieldcal.flight.job import Job, PlainJob
 from fieldcal.flight.threads import one_thread
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.run_key import code_digest
 from fieldcal.warehouse.errors import WarehouseError
 
-OTHER_CODE = [
-    "code_changed",
+OTHER_CODE: list[str] = [
+    ReasonCode.CODE_CHANGED,
     "fieldcal's own source is not the same in all processes of this night: it was edited or installed anew while the "
     "night ran, or the workers have another version. Nothing is lost; run it again.",
 ]
@@ -54,16 +55,16 @@ def one_flight(root: Path, job: Job, settings: Configuration, do: Step = FlightW
 def flights(
     root: str,
     source: Source,
-    jobs: list[dict[str, Any]],
+    jobs: Sequence[PlainJob],
     code: str,
     do: Step = FlightWork.do,
     tell: Callable[[Outcome], None] | None = None,
-) -> dict[str, Any]:
+) -> Answer:
     """A batch of flights in this process: `outcomes`, plain JSON, and `error`: what concerns every log of the night.
 
     `code` is the `code_digest` of the process that planned the night; a process with other code does nothing.
     """
-    outcomes: list[dict[str, Any]] = []
+    outcomes: list[PlainOutcome] = []
     if code_digest() != code:
         return {"outcomes": outcomes, "error": OTHER_CODE}
     know_sources(Path(root), keep=False)
@@ -80,6 +81,6 @@ def flights(
     return {"outcomes": outcomes, "error": None}
 
 
-def lost(job: Mapping[str, Any], reason: str) -> dict[str, Any]:
+def lost(job: PlainJob, reason: str) -> PlainOutcome:
     """Outcome, as plain JSON, of a flight that took its process down."""
     return failed_outcome(Job(**job), {}, STEPS[0], reason).plain()

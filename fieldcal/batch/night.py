@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol, cast
 
 import polars as pl
 
 from fieldcal.batch.closing import Closing
+from fieldcal.batch.documents import NightDocument
 from fieldcal.batch.log_ledger import write_ledger
 from fieldcal.batch.outcome import Outcome, summary
 from fieldcal.batch.plan import Plan, make_plan
@@ -52,11 +53,11 @@ class Night:
                 records = self.plan.unchanged[job.flight_id]
                 yield Outcome(job, records, cached=tuple(records))
 
-    def document(self, outcomes: Sequence[Outcome], closing: Closing) -> dict[str, Any]:
+    def document(self, outcomes: Sequence[Outcome], closing: Closing) -> NightDocument:
         """The JSON of the night, without how long it took."""
         changes = [change.row() for change in closing.changes]
-        told = summary(outcomes, self.plan.copies, self.plan.copied, self.root)
-        return {**told, "changes": changes, "report": str(closing.report)}
+        told: dict[str, object] = dict(summary(outcomes, self.plan.copies, self.plan.copied, self.root))
+        return cast(NightDocument, {**told, "changes": changes, "report": str(closing.report)})
 
 
 def plan_night(archive: Path, root: Path, config: Path | None = None, session: Path | None = None) -> Night:

@@ -6,10 +6,10 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
+from fieldcal.batch.documents import LogEntry, NightSummary, PlainOutcome
 from fieldcal.batch.reasons import NO_RESULT
 from fieldcal.flight.job import Job
 from fieldcal.flight.record import Record
@@ -41,7 +41,7 @@ class Outcome:
     def __post_init__(self) -> None:
         object.__setattr__(self, "facts", judged(self.records[INGEST]["facts"], self.records))
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> PlainOutcome:
         """Plain JSON; `Outcome.of` is the outcome again."""
         return {
             "job": self.job.plain(),
@@ -53,12 +53,12 @@ class Outcome:
         }
 
     @staticmethod
-    def of(plain: Mapping[str, Any]) -> Outcome:
+    def of(plain: PlainOutcome) -> Outcome:
         """From its plain JSON."""
-        given = {**plain, "job": Job(**plain["job"]), "ran": tuple(plain["ran"]), "cached": tuple(plain["cached"])}
-        return Outcome(**given)
+        ran, cached = tuple(plain["ran"]), tuple(plain["cached"])
+        return Outcome(Job(**plain["job"]), plain["records"], ran, cached, plain["why"], plain["work_s"])
 
-    def entry(self) -> dict[str, Any]:
+    def entry(self) -> LogEntry:
         """The flight's place in the JSON of a night."""
         return {
             "log_uri": self.job.log_uri,
@@ -103,9 +103,7 @@ def failed_outcome(job: Job, records: Mapping[str, Record], step: str, reason: s
     return Outcome(job, {**records, step: record}, ran=(step,))
 
 
-def summary(
-    outcomes: Iterable[Outcome], copies: Mapping[str, str], copied: Iterable[Job], root: Path
-) -> dict[str, Any]:
+def summary(outcomes: Iterable[Outcome], copies: Mapping[str, str], copied: Iterable[Job], root: Path) -> NightSummary:
     """The JSON of a night, without its duration."""
     outcomes = list(outcomes)
     entries = {outcome.job.log_uri: outcome.entry() for outcome in outcomes}
@@ -114,7 +112,10 @@ def summary(
     logs = [entries[log_uri] for log_uri in sorted(entries)]
     counts = Counter(entry["verdict"] for entry in logs)
     return {
-        **{verdict: counts[verdict] for verdict in Verdict},
+        "ok": counts[Verdict.OK],
+        "partial": counts[Verdict.PARTIAL],
+        "quarantined": counts[Verdict.QUARANTINED],
+        "rejected": counts[Verdict.REJECTED],
         "stages_run": sum(len(outcome.ran) for outcome in outcomes),
         "stages_cached": sum(len(outcome.cached) for outcome in outcomes),
         "stage_seconds": round(sum(outcome.work_s for outcome in outcomes), 3),
@@ -122,7 +123,13 @@ def summary(
     }
 
 
-def _copy(job: Job, first: str, entries: Mapping[str, Mapping[str, Any]], root: Path) -> dict[str, Any]:
+def verdict_counts(night: NightSummary) -> str:
+    """How many logs have which verdict, in words."""
+    counts: Mapping[str, object] = night
+    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in Verdict)
+
+
+def _copy(job: Job, first: str, entries: Mapping[str, LogEntry], root: Path) -> LogEntry:
     """Entry of a log whose content is that of another: it shares its verdict, and says where the results are."""
     verdict = entries[first]["verdict"] if first in entries else _recorded_verdict(job.flight_id, root)
     return {

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from typing import Any
 
+from fieldcal.flight.record import Causes, Record
 from fieldcal.stages.run_key import LIBRARIES
 
 NO_RESULT = "no result yet"
 LONGEST_VALUE = 40
 
 
-def why_it_runs(former: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+def why_it_runs(former: Record, now: Causes) -> str:
     """A sentence without its full stop: "smoothing_cutoff_hz 8.0 → 6.0", "new input: attitude.attitude", …
 
     Parameters
@@ -27,7 +27,7 @@ def why_it_runs(former: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     return "; ".join(_differences(former, now)) or "its last result was made otherwise"
 
 
-def _differences(former: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+def _differences(former: Record, now: Causes) -> Iterator[str]:
     yield from _changed(former.get("params", {}), now["params"])
     if inputs := [name for name, sha256 in now["inputs"].items() if former.get("inputs", {}).get(name) != sha256]:
         yield f"new input: {', '.join(inputs)}"
@@ -35,15 +35,16 @@ def _differences(former: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[
         yield f"input no longer there: {', '.join(lost)}"
     if former.get("source") != now["source"]:
         yield "its code changed"
-    yield from _changed(*({name: own.get("versions", {}).get(name) for name in LIBRARIES} for own in (former, now)))
+    before, after = former.get("versions", {}), now["versions"]
+    yield from _changed({name: before.get(name) for name in LIBRARIES}, {name: after.get(name) for name in LIBRARIES})
 
 
-def _changed(before: Mapping[str, Any], after: Mapping[str, Any]) -> Iterator[str]:
+def _changed(before: Mapping[str, object], after: Mapping[str, object]) -> Iterator[str]:
     for name in sorted({*before, *after}):
         if before.get(name) != after.get(name):
             yield f"{name} {_shown(before.get(name))} → {_shown(after.get(name))}"
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
     return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]}…"

@@ -26,7 +26,7 @@ from fieldcal.flight.versions import versions
 from fieldcal.logs import ingest
 from fieldcal.logs.facts import Facts
 from fieldcal.logs.tidy import Disordered
-from fieldcal.names import Status, Verdict
+from fieldcal.names import Json, Status, Verdict
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.pipeline import INGEST, PIPELINE
 from fieldcal.stages.results import StageResult, plain
@@ -93,7 +93,7 @@ class FlightWork:
         record = None if stored is None else _of_store(stored)
         if record is None or (step == INGEST and not self._signals_whole(record)):
             former = self._store.latest(step, self.job.flight_id)
-            self.why[step] = NO_RESULT if former is None else why_it_runs(former, self._causes(step))
+            self.why[step] = NO_RESULT if former is None else why_it_runs(_of_store(former), self._causes(step))
             return None
         self._take(step, record)
         return record
@@ -134,7 +134,7 @@ class FlightWork:
         if step == INGEST:
             self._settings = ingest.settings_of(record["facts"], self._vehicle) if self.usable() else None
 
-    def _params(self, step: str) -> dict[str, Any]:
+    def _params(self, step: str) -> Mapping[str, Json]:
         if step != INGEST:
             return as_json(taken_from(self._known(), STAGES[step].takes))
         settings = self._vehicle.settings()

@@ -38,7 +38,7 @@ def check(
     try:
         found = load(path)
     except ConfigurationError as error:
-        mistakes = error.measured.get("mistakes", [error.sentence])
+        mistakes = error.mistakes
         if as_json:
             print_json({"file": str(path), "ok": False, "vehicles": [], "mistakes": mistakes})
         else:

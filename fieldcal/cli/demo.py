@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.numbers import number, with_sd
+from fieldcal.words.rows import Row
 from fieldcal.words.talk import say
 
 VEHICLES, SESSIONS, FLIGHTS = 2, 2, 1
@@ -49,7 +49,7 @@ def run_demo(folder: Path, root: Path, config: Path | None) -> bool:
     return bool(result["ok"] != len(result["logs"]))
 
 
-def _beside_truth(root: Path, flight_id: str, truth: Mapping[str, Any], uri: str) -> Any:
+def _beside_truth(root: Path, flight_id: str, truth: Row, uri: str) -> Any:
     """Scale and zero of one flight, with sd, the truth, and the error in sd and per cent."""
     rows = Warehouse(root).scan("calibration", flight_id=flight_id).filter(pl.col("parameter").is_in(["scale", "zero"]))
     found = {
@@ -70,7 +70,7 @@ def _beside_truth(root: Path, flight_id: str, truth: Mapping[str, Any], uri: str
     return table(columns, lines, f"{uri} beside the truth of the simulation")
 
 
-def _error(row: Mapping[str, Any], true: float) -> tuple[str, str]:
+def _error(row: Row, true: float) -> tuple[str, str]:
     error = row["value"] - true
     in_sd = f"{error / row['sd']:+.1f}" if row["sd"] else "–"
     return f"{100 * error / abs(true):+.2f}", in_sd

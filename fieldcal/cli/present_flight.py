@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
@@ -11,12 +10,13 @@ from fieldcal.cli.show import table
 from fieldcal.names import Status
 from fieldcal.words.flights import QUANTITIES, Rows, advised, is_consequence, sync_sentence, verdict_sentence
 from fieldcal.words.numbers import cell, number, with_sd
+from fieldcal.words.rows import Row
 
 AXES = ("x", "y", "z")
 PARAMETERS = ("scale", "zero", "bias")
 
 
-def print_flight(console: Console, document: Mapping[str, Any]) -> None:
+def print_flight(console: Console, document: Row) -> None:
     """Print what `fieldcal.flight.calibrate.calibrate_log` found."""
     flight = document["flight"]
     console.print(verdict_sentence(flight), markup=False)
@@ -52,7 +52,7 @@ def parameter_table(rows: Rows) -> Any:
     return table(["sensor", "method", "axis", *PARAMETERS, "status"], lines)
 
 
-def _value(row: Mapping[str, Any] | None) -> str:
+def _value(row: Row | None) -> str:
     return "–" if row is None else f"{with_sd(row['value'], row['sd'])} {row['unit']}"
 
 
@@ -87,5 +87,5 @@ def fit_table(rows: Rows) -> Any:
     return table(["quantity", "method", "against", "TIC raw", "rms raw", "TIC smoothed", "rms smoothed"], lines)
 
 
-def _fit(row: Mapping[str, Any] | None) -> tuple[str, str]:
+def _fit(row: Row | None) -> tuple[str, str]:
     return ("–", "–") if row is None else (number(row["tic"], 4), f"{number(row['rms'], 3)} {row['rms_unit']}")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
-from fieldcal.batch.outcome import cause
+from fieldcal.batch.documents import LogEntry, NightDocument, PlanDocument, PlannedLog
+from fieldcal.batch.outcome import cause, verdict_counts
 from fieldcal.cli.show import table
 from fieldcal.names import Verdict
 from fieldcal.warehouse import Warehouse
@@ -20,9 +20,9 @@ REFUSALS = 12
 CHANGES = 20
 
 
-def print_night(console: Console, result: Mapping[str, Any], root: Path) -> None:
+def print_night(console: Console, result: NightDocument, root: Path) -> None:
     """The closing table: verdicts, what was refused and why, the worst fits, where to look next."""
-    counts = ", ".join(f"{result[verdict]} {verdict}" for verdict in Verdict)
+    counts = verdict_counts(result)
     work = f"{result['stages_run']} stages run, {result['stages_cached']} from the cache, {result['seconds']:.1f} s"
     console.print(f"{len(result['logs'])} logs: {counts}; {work}", markup=False)
     troubled = [log for log in result["logs"] if log["verdict"] != Verdict.OK or log["reason_code"]]
@@ -47,17 +47,17 @@ def print_night(console: Console, result: Mapping[str, Any], root: Path) -> None
     console.print(f"Report:  {result['report']} (fieldcal report --vehicle V, --flight ID)", markup=False)
 
 
-def _refusals(log: Mapping[str, Any]) -> list[list[str]]:
+def _refusals(log: LogEntry) -> list[list[str]]:
     """Lines of what a log's stages refused, each reason once; what only follows from another refusal is left out."""
     stages: dict[str, list[str]] = {}
     for refusal in log["refusals"]:
         if not is_consequence(refusal):
-            stages.setdefault(refusal["reason"] or refusal["reason_code"], []).append(refusal["stage"])
+            stages.setdefault(refusal["reason"] or refusal["reason_code"] or "", []).append(refusal["stage"])
     names = [log["log_uri"], *[""] * len(stages)]
     return [[name, ", ".join(own), reason] for name, (reason, own) in zip(names, stages.items(), strict=False)]
 
 
-def print_plan(console: Console, plan: Mapping[str, Any]) -> None:
+def print_plan(console: Console, plan: PlanDocument) -> None:
     """What a night would do."""
     console.print(
         f"{len(plan['logs'])} logs; {plan['stages_to_run']} stages would run. Nothing was changed.", markup=False
@@ -67,7 +67,7 @@ def print_plan(console: Console, plan: Mapping[str, Any]) -> None:
         console.print(table(["log", "would run"], lines))
 
 
-def _would(log: Mapping[str, Any]) -> str:
+def _would(log: PlannedLog) -> str:
     if log["copy_of"]:
         return f"nothing: a copy of {log['copy_of']}"
     return cause(log["would_run"])

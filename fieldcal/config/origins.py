@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 from pydantic.fields import FieldInfo
 
@@ -12,7 +12,7 @@ from fieldcal.config.configuration import Configuration, LocalField, VehicleTabl
 from fieldcal.config.mistakes import key_path
 from fieldcal.config.parameters import PROFILES, Parameters
 from fieldcal.config.values import Table
-from fieldcal.names import ProfileName
+from fieldcal.names import Json, ProfileName
 
 DEFAULT = "default"
 Layers = Sequence[tuple[str, Table]]
@@ -25,7 +25,7 @@ class Entry:
     "default"."""
 
     keys: tuple[str, ...]
-    value: Any
+    value: Json
     source: str
     unit: str
     meaning: str
@@ -70,13 +70,13 @@ def _of_the_other_form(field: LocalField, name: str) -> bool:
     return name not in ("unit", "north_east_down") if field.north_east_down is not None else name == "north_east_down"
 
 
-def _entry(keys: tuple[str, ...], value: Any, source: str, field: FieldInfo) -> Entry:
+def _entry(keys: tuple[str, ...], value: object, source: str, field: FieldInfo) -> Entry:
     extra = field.json_schema_extra
     unit = extra.get("unit", "") if isinstance(extra, dict) else ""
     return Entry(keys, _plain(value), source, str(unit), field.description or "")
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Json:
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
-    return str(value) if isinstance(value, str) else value
+    return str(value) if isinstance(value, str) else cast("float | None", value)

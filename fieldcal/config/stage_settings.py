@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, TypeVar
+from typing import TypeVar, cast
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -19,6 +19,7 @@ from fieldcal.names import (
     EllipsoidFit,
     Equations,
     InitialAttitude,
+    Json,
     Rotation,
     SegmentEnds,
     Sensor,
@@ -297,12 +298,12 @@ def taken_from(flight: FlightSettings, kind: type[S]) -> S:
     return kind(**{name: given[name] for name in names_of(kind)})
 
 
-def as_json(settings: StageSettings) -> dict[str, Any]:
+def as_json(settings: StageSettings) -> dict[str, Json]:
     """A stage's settings as plain JSON, as they enter its run key and its record."""
     return {name: _json(value) for name, value in asdict(settings).items()}
 
 
-def from_json(plain: Mapping[str, Any], kind: type[S]) -> S | None:
+def from_json(plain: Mapping[str, object], kind: type[S]) -> S | None:
     """The settings of a class from the plain JSON of one record or more; None where something is missing."""
     try:
         return TypeAdapter(kind).validate_python({name: plain[name] for name in names_of(kind) if name in plain})
@@ -310,9 +311,9 @@ def from_json(plain: Mapping[str, Any], kind: type[S]) -> S | None:
         return None
 
 
-def _json(value: Any) -> Any:
+def _json(value: object) -> Json:
     if isinstance(value, Mapping):
         return {str(key): _json(item) for key, item in value.items()}
     if isinstance(value, tuple):
         return [_json(item) for item in value]
-    return str(value) if isinstance(value, str) else value
+    return str(value) if isinstance(value, str) else cast("float | None", value)

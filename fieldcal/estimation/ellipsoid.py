@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +22,7 @@ from fieldcal.estimation.statistics import (
     white_noise_sigma,
 )
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
 
 # Li and Griffiths' constraint 4J − I² > 0 on (θ1, θ2, θ3), and its inverse.
@@ -58,13 +58,17 @@ class TriadFit:
         """z = Λ z_d + b (Eq. 5), (n, 3) logged → (n, 3) in the field's unit, sensor axes."""
         return np.asarray(logged, dtype=float) @ self.scale.T + self.bias
 
-    def measured(self) -> dict[str, Any]:
+    @property
+    def scale_relative_sd(self) -> list[float]:
+        """Claimed sd of the three scales over them."""
+        return [float(v) for v in np.sqrt(np.diagonal(self.covariance)[:3]) / np.abs(self.scale_diagonal)]
+
+    def measured(self) -> dict[str, Json]:
         """The numbers behind the verdict, for the `run` table."""
-        relative = np.sqrt(np.diagonal(self.covariance)[:3]) / np.abs(self.scale_diagonal)
         return {
             "n_samples": self.n_samples,
             "condition_number": float(self.condition),
-            "scale_relative_sd": [float(v) for v in relative],
+            "scale_relative_sd": self.scale_relative_sd,
             "residual_rms_relative": self.residual_rms,
             "mean_robust_weight": self.share_used,
             "iterations": self.iterations,
@@ -421,7 +425,7 @@ def require_determined(
         `too_little_motion`, `scale_uncertain`, `not_a_sphere` or `scale_not_nominal`; `measured` has all the numbers.
     """
     measured = fit.measured()
-    relative = max(measured["scale_relative_sd"])
+    relative = max(fit.scale_relative_sd)
     if not fit.condition <= max_condition:
         raise UnusableFlight(
             ReasonCode.TOO_LITTLE_MOTION,

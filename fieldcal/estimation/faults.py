@@ -7,13 +7,13 @@ fails here is not worth a fit. Readings are as logged, (n, 3); stamps in seconds
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fieldcal.estimation.segments import run_starts
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
 
 AXES = "xyz"
@@ -72,7 +72,7 @@ class Fault:
     fatal: bool
     sentence: str
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> dict[str, Json]:
         """Plain JSON."""
         return asdict(self)
 

@@ -19,7 +19,7 @@ from fieldcal.flight.threads import one_thread
 from fieldcal.flight.versions import versions
 from fieldcal.logs import flight_id, ingest, log_format, log_sha256
 from fieldcal.logs.facts import Facts
-from fieldcal.names import SENSORS, Approach, Status, Verdict
+from fieldcal.names import SENSORS, Approach, Json, Status, Verdict
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.pipeline import INGEST, PIPELINE
 from fieldcal.stages.results import StageResult, plain
@@ -166,7 +166,7 @@ def _job(log: Path, vehicle_id: str, session_id: str, archive: Path) -> Job:
 
 def _ingest_result(facts: Facts) -> StageResult:
     status = Status.OK if Verdict(facts["verdict"]).usable else Status.REFUSED
-    measured = {"rows": facts["rows"], "units": facts["units"], "verdict": facts["verdict"]}
+    measured: dict[str, Json] = {"rows": facts["rows"], "units": facts["units"], "verdict": facts["verdict"]}
     code = None if facts["reason_code"] is None else ReasonCode(facts["reason_code"])
     return StageResult(status=status, reason_code=code, reason=facts["reason"], measured=measured)
 

@@ -2,9 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
+
+
+class PlainJob(TypedDict):
+    """A `Job` as plain JSON."""
+
+    path: str
+    log_uri: str
+    vehicle_id: str
+    session_id: str
+    log_format: str
+    sha256: str | None
+    flight_id: str
+    stamp: list[int]
+    problem: str | None
 
 
 @dataclass(frozen=True)
@@ -18,12 +33,22 @@ class Job:
     log_format: str
     sha256: str | None
     flight_id: str
-    stamp: tuple[int, ...] = ()
+    stamp: Sequence[int] = ()
     problem: str | None = None
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> PlainJob:
         """Plain JSON; `Job(**plain)` is the job again."""
-        return {**asdict(self), "stamp": list(self.stamp)}
+        return {
+            "path": self.path,
+            "log_uri": self.log_uri,
+            "vehicle_id": self.vehicle_id,
+            "session_id": self.session_id,
+            "log_format": self.log_format,
+            "sha256": self.sha256,
+            "flight_id": self.flight_id,
+            "stamp": list(self.stamp),
+            "problem": self.problem,
+        }
 
 
 def file_stamp(path: Path) -> tuple[int, ...]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NotRequired, TypedDict
 
 from fieldcal.logs.facts import Facts
+from fieldcal.names import Json
 
 
 class Output(TypedDict):
@@ -20,7 +22,7 @@ class Causes(TypedDict):
     """What the key of a step is made of."""
 
     run_key: str
-    params: dict[str, Any]
+    params: Mapping[str, Json]
     inputs: dict[str, str]
     source: str
     versions: dict[str, str]
@@ -37,13 +39,22 @@ class StepRecord(TypedDict):
     run_key: str | None
 
 
+class Refusal(TypedDict):
+    """A step that refused or failed, with its code and sentence."""
+
+    stage: str
+    status: str
+    reason_code: str | None
+    reason: str | None
+
+
 class Record(StepRecord, total=False):
     """The same of a step of a night, with what its key is made of and the sha256 of all it wrote.
 
     `facts` and `signals` are of the step that reads the log. `unkept`: the next night tries again.
     """
 
-    params: dict[str, Any]
+    params: Mapping[str, Json]
     inputs: dict[str, str]
     source: str
     outputs: dict[str, Output]

@@ -11,7 +11,7 @@ import polars as pl
 
 from fieldcal import schemas
 from fieldcal.flight.job import Job
-from fieldcal.flight.record import StepRecord
+from fieldcal.flight.record import Refusal, StepRecord
 from fieldcal.logs import ingest
 from fieldcal.logs.facts import Facts, FindingFacts
 from fieldcal.names import Status, Verdict
@@ -101,7 +101,7 @@ def judged(facts: Facts, records: Mapping[str, StepRecord]) -> Facts:
     return facts
 
 
-def refusals(records: Mapping[str, StepRecord]) -> list[dict[str, Any]]:
+def refusals(records: Mapping[str, StepRecord]) -> list[Refusal]:
     """Stages that refused or failed, with code and sentence."""
     return [
         {"stage": step, "status": record["status"], "reason_code": record["reason_code"], "reason": record["reason"]}

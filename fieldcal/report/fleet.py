@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
@@ -19,6 +18,7 @@ from fieldcal.report.words import age, day, plain_name, with_unit
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.questions import existing
 from fieldcal.words.numbers import number
+from fieldcal.words.rows import Row
 
 LOOKS = 200
 NOT_ANALYSED = "not analysed"
@@ -94,8 +94,8 @@ def _row(
     vehicle: str,
     flights: pl.DataFrame,
     status: str | None,
-    last: Mapping[str, Any] | None,
-    tic: Mapping[str, Any] | None,
+    last: Row | None,
+    tic: Row | None,
     spark: tuple[str, str] | None,
     links: Links,
     as_of: datetime | None,
@@ -118,11 +118,11 @@ def _row(
     ]
 
 
-def _quantity(fit: Mapping[str, Any]) -> str:
+def _quantity(fit: Row) -> str:
     return f"{plain_name(fit['quantity'])} against {plain_name(fit['reference'])}"
 
 
-def _worst_tics(warehouse: Warehouse, last: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+def _worst_tics(warehouse: Warehouse, last: Mapping[str, Row]) -> dict[str, Row]:
     wanted = [row["flight_id"] for row in last.values()]
     rows = (
         warehouse.scan("fit")
@@ -133,14 +133,14 @@ def _worst_tics(warehouse: Warehouse, last: Mapping[str, Mapping[str, Any]]) -> 
     return {row["vehicle_id"]: row for row in rows.iter_rows(named=True)}
 
 
-def _siblings(drift: pl.DataFrame, row: Mapping[str, Any]) -> list[float]:
+def _siblings(drift: pl.DataFrame, row: Row) -> list[float]:
     """Values at 25 °C of the same parameter of the fleet's other IMUs."""
     same = (pl.col(name) == row[name] for name in ("sensor", "method", "parameter", "axis", "unit"))
     others = drift.filter(*same, pl.col("imu_id") != row["imu_id"], pl.col("value_at_25degc").is_not_null())
     return others["value_at_25degc"].to_list()
 
 
-def _unsteady(drift: pl.DataFrame) -> list[dict[str, Any]]:
+def _unsteady(drift: pl.DataFrame) -> list[Row]:
     """Rows that need a look. `bias` and `zero` follow from `zero_bias`: where that says the same they are left out."""
     found = [
         row

@@ -18,6 +18,7 @@ from fieldcal.report.words import count, day, exactness, plain_name, scientific,
 from fieldcal.stages.warm_up import METHOD as WARM_UP
 from fieldcal.words.flights import QUANTITIES, advised, is_consequence, sync_sentence
 from fieldcal.words.numbers import cell, number
+from fieldcal.words.rows import Row
 
 PAPER_TIC = {
     ("attitude", "quest", "vps"): 0.0352,
@@ -79,7 +80,7 @@ def _refusals(data: FlightData) -> list[Part]:
     findings = [f for f in flight["findings"] or [] if f["sentence"] != flight["reason"]]
     parts += [Text(str(finding["sentence"])) for finding in findings]
     stopped = [row for row in data.run if row["status"] in (Status.REFUSED, Status.FAILED) and row["stage"] != "ingest"]
-    told: dict[str, list[dict[str, Any]]] = {}
+    told: dict[str, list[Row]] = {}
     for row in stopped:
         if not is_consequence(row):
             told.setdefault(str(row["measured"].get("reason") or row["reason_code"]), []).append(row)
@@ -127,7 +128,7 @@ def _constants(calibration: pl.DataFrame) -> list[Part]:
     return parts
 
 
-def _paper_table(rows: Sequence[Mapping[str, Any]], caption: str, letter: str) -> Table:
+def _paper_table(rows: Sequence[Row], caption: str, letter: str) -> Table:
     """Rows as the paper has them, a parameter and axis a line, a method a column, equation error first."""
     methods = sorted({r["method"] for r in rows}, key=lambda m: -exactness(m) if m in PREFERRED_METHODS else 0)
     by_place = {(r["parameter"], r["axis"], r["method"]): r for r in rows}
@@ -169,7 +170,7 @@ def _agreement(data: FlightData) -> list[Part]:
         own = [by_place.get((*key, signal)) for signal in ("raw", "smoothed")]
         printed = PAPER_TIC.get(key[:3]) if key[3] == "all" else None
         cells = [text for row in own for text in _fit_cells(row)]
-        quantity = QUANTITIES.get(key[0], key[0]) + ("" if key[3] == "all" else ", held out")
+        quantity = str(QUANTITIES.get(key[0], key[0])) + ("" if key[3] == "all" else ", held out")
         names = [quantity, plain_name(key[1]), plain_name(key[2])]
         lines.append([*names, "–" if printed is None else f"{printed:.4f}", *cells])
     columns = (
@@ -188,7 +189,7 @@ def _agreement(data: FlightData) -> list[Part]:
     ]
 
 
-def _fit_cells(row: Mapping[str, Any] | None) -> tuple[str, str]:
+def _fit_cells(row: Row | None) -> tuple[str, str]:
     if row is None or row["tic"] is None:
         return "–", "–"
     return (f"{row['tic']:.4f}", with_unit(number(row["rms"], 3), row["rms_unit"]))
@@ -235,7 +236,7 @@ def _figures(data: FlightData) -> list[Section]:
     return [*sections, Section("quality", "Residuals and gates", quality)] if quality else sections
 
 
-def _fits(c: Curves, fit: Sequence[Mapping[str, Any]]) -> list[Part]:
+def _fits(c: Curves, fit: Sequence[Row]) -> list[Part]:
     """Figures 7–10, each with its coefficient; a sentence where one cannot be."""
     told = {quantity: _coefficients(fit, quantity) for quantity in QUANTITIES}
     parts: list[Part] = [draw.attitude(c, told["attitude"] or "There is no VPS to compare with.")]
@@ -254,7 +255,7 @@ def _fits(c: Curves, fit: Sequence[Mapping[str, Any]]) -> list[Part]:
     return parts
 
 
-def _coefficients(fit: Sequence[Mapping[str, Any]], quantity: str) -> str:
+def _coefficients(fit: Sequence[Row], quantity: str) -> str:
     """Eq. 16 of a quantity in words, smoothed readings as the figures show them."""
     own = [r for r in fit if r["quantity"] == quantity and r["signal"] == "smoothed" and r["tic"] is not None]
     if not own:
@@ -312,7 +313,7 @@ def _stages(data: FlightData) -> list[Part]:
     return parts
 
 
-def _numbers(measured: Mapping[str, Any] | None) -> str:
+def _numbers(measured: Row | None) -> str:
     """What a stage measured, in a line."""
     return ", ".join(f"{k} = {_plain(v)}" for k, v in (measured or {}).items() if k != "reason")
 
@@ -325,7 +326,7 @@ def _plain(value: Any) -> str:
     return cell(value)
 
 
-def _temperature(flight: Mapping[str, Any]) -> str:
+def _temperature(flight: Row) -> str:
     low, mean, high = (flight[f"temperature_{k}_degc"] for k in ("min", "mean", "max"))
     return "not logged" if mean is None else f"{low:.1f} … {high:.1f} °C, mean {mean:.1f}"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,9 @@ from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.stage_store import StageStore
-from fieldcal.words.rows import rows_of, unfolded
+from fieldcal.words.rows import Row, rows_of, unfolded
 
 STAGE_TABLES = ("manoeuvre.segments", "smoothing.samples", "attitude_pass2.attitude", "vps_sync.vps_aligned")
-Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,11 +43,11 @@ class FlightData:
 
     flight: Row
     calibration: pl.DataFrame
-    fit: list[dict[str, Any]]
+    fit: Sequence[Row]
     sync: Row | None
-    run: list[dict[str, Any]]
+    run: Sequence[Row]
     tables: Mapping[str, pl.DataFrame]
-    parameters: Mapping[str, Any]
+    parameters: Row
     settings: FigureSettings | None
     gone: tuple[str, ...] = field(default=())
 
@@ -143,7 +142,7 @@ def _signal(warehouse: Warehouse, name: str, ids: Mapping[str, str]) -> pl.DataF
 
 
 def _stages(
-    root: Path, flight_id: str, run: list[dict[str, Any]]
+    root: Path, flight_id: str, run: Sequence[Row]
 ) -> tuple[dict[str, pl.DataFrame], dict[str, Any], tuple[str, ...]]:
     """Tables that are there, the parameters of their stages, and the stages that should be there and are not."""
     store = StageStore(root)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
 
@@ -13,6 +12,7 @@ from fieldcal.names import Status
 from fieldcal.report.words import day
 from fieldcal.stages.warm_up import METHOD as WARM_UP
 from fieldcal.warehouse import Warehouse
+from fieldcal.words.rows import Row
 
 
 def newest(warehouse: Warehouse) -> datetime | None:
@@ -46,7 +46,7 @@ def unfold(text: Any) -> Any:
     return json.loads(text) if isinstance(text, str) else text
 
 
-def reason_of(row: Mapping[str, Any]) -> str:
+def reason_of(row: Row) -> str:
     """Why a row of the view `refusals` is there: its sentence, else its code."""
     detail = row["detail"]
     if row["level"] == "stage":

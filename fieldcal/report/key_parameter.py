@@ -11,6 +11,7 @@ from fieldcal.names import GRAVEST_FIRST, INERTIAL_FIRST, DriftStatus, Status
 from fieldcal.report.plot import sparkline
 from fieldcal.report.words import PARAMETERS, count, preferred, scientific, unit, with_unit
 from fieldcal.warehouse import Warehouse
+from fieldcal.words.rows import Row
 
 POINTS = 60
 PLACE = ("sensor", "method", "parameter", "axis")
@@ -61,7 +62,7 @@ def _least_steady(drift: pl.DataFrame | None, there: set[Any]) -> dict[str, Any]
     return min(found, key=_steadiness, default=None)
 
 
-def _steadiness(row: Mapping[str, Any]) -> tuple[Any, ...]:
+def _steadiness(row: Row) -> tuple[Any, ...]:
     status = GRAVEST_FIRST.index(DriftStatus(row["status"])) if row["status"] in GRAVEST_FIRST else len(GRAVEST_FIRST)
     parameter = PARAMETERS.index(row["parameter"]) if row["parameter"] in PARAMETERS else len(PARAMETERS)
     return status, parameter, -abs(row["last_z"] or 0.0), *(row[name] for name in PLACE)

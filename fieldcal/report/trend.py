@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import datetime
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -13,6 +12,7 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import GRAVEST_FIRST, DriftStatus
 from fieldcal.report.words import count, day, scientific, with_unit
 from fieldcal.schemas.reference import REFERENCE_DEGC
+from fieldcal.words.rows import Row
 
 """Worst first; `insufficient` says nothing, so a vehicle has it only where nothing else is known."""
 
@@ -27,7 +27,7 @@ def worst_status(drift: pl.DataFrame | None) -> str | None:
     return next((status for status in GRAVEST_FIRST if status in there), min(map(str, there)))
 
 
-def change_sentence(row: Mapping[str, Any], siblings: Sequence[float]) -> str:
+def change_sentence(row: Row, siblings: Sequence[float]) -> str:
     """What is not steady about a drift row: its own sentence, and what the siblings show of an outlier."""
     told = str(row["reason"] or "")
     if row["status"] == DriftStatus.OUTLIER and siblings:
@@ -41,14 +41,14 @@ def change_sentence(row: Mapping[str, Any], siblings: Sequence[float]) -> str:
     return "–" if slope == "–" else f"{with_unit(slope, row['unit'])} per day."
 
 
-def warmed(row: Mapping[str, Any], degc: Array | float) -> Array:
+def warmed(row: Row, degc: Array | float) -> Array:
     """What a drift row's regression adds to the value at 25 °C at another temperature."""
     d = np.asarray(degc, dtype=float) - REFERENCE_DEGC
     first, second, third = (row[c] or 0.0 for c in ("slope_per_degc", "curve_per_degc2", "curve_per_degc3"))
     return np.asarray(first * d + second * d**2 + third * d**3)
 
 
-def predicted(row: Mapping[str, Any], degc: Array | float, days: Array | float) -> tuple[Array, Array]:
+def predicted(row: Row, degc: Array | float, days: Array | float) -> tuple[Array, Array]:
     """Value and standard deviation of a drift row's regression at a temperature, so many days after its moment.
 
     The value at 25 °C and the slope on temperature are correlated; they are independent at `best_known_degc`, B:
@@ -71,7 +71,7 @@ def days_after(moments: list[datetime | None], reference: datetime) -> Array:
     return np.array([np.nan if m is None else (m - reference).total_seconds() / DAY_S for m in moments])
 
 
-def fly_with_sentence(row: Mapping[str, Any]) -> str:
+def fly_with_sentence(row: Row) -> str:
     """Where a constant to fly with comes from: a row of `latest_calibration`."""
     if row["source"] != "flight":
         return str(row["why"])

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
@@ -24,6 +23,7 @@ from fieldcal.stages.warm_up import PARAMETER as WARM_UP_SLOPE
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.questions import existing
 from fieldcal.words.numbers import number
+from fieldcal.words.rows import Row
 
 FLIGHTS, REFUSALS, FEWEST_POINTS = 200, 100, 30
 OPEN = ("scale", "zero_bias", WARM_UP_SLOPE)
@@ -86,7 +86,7 @@ def _fly_with(warehouse: Warehouse, imu_id: str) -> list[Part]:
     if rows.is_empty():
         return [Notice("No flight gave a constant: there is nothing to fly with.")]
     axes = sorted(rows["axis"].unique().to_list())
-    by_place: dict[tuple[str, str], dict[str, dict[str, Any]]] = {}
+    by_place: dict[tuple[str, str], dict[str, Row]] = {}
     for r in rows.iter_rows(named=True):
         by_place.setdefault((r["sensor"], r["parameter"]), {})[r["axis"]] = r
     lines = []
@@ -113,7 +113,7 @@ def _fly_with(warehouse: Warehouse, imu_id: str) -> list[Part]:
     ]
 
 
-def _sources(by_axis: Mapping[str, Mapping[str, Any]]) -> str:
+def _sources(by_axis: Mapping[str, Row]) -> str:
     """Where the constants of a parameter come from, axes of one source together."""
     axes: dict[str, list[str]] = {}
     for axis in sorted(by_axis):
@@ -166,11 +166,11 @@ def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
     return [*parts, Folded(f"All {len(ordered)} regressions: {', '.join(counts)}", [every])]
 
 
-def _name(row: Mapping[str, Any]) -> str:
+def _name(row: Row) -> str:
     return f"{plain_name(row['sensor'])} {row['parameter']} ({plain_name(row['method'])})"
 
 
-def _trend_table(caption: str, rows: list[dict[str, Any]]) -> Table:
+def _trend_table(caption: str, rows: Sequence[Row]) -> Table:
     columns = (
         Column("parameter"),
         Column("axis"),

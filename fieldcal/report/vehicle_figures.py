@@ -16,6 +16,7 @@ from fieldcal.report.plot import INK, XYZ, headed, legend_below, panels, svg
 from fieldcal.report.trend import days_after, predicted, warmed
 from fieldcal.report.words import count, day, unit
 from fieldcal.schemas.reference import REFERENCE_DEGC
+from fieldcal.words.rows import Row
 
 MOST_POINTS = 250
 """Flights in a panel; fewer where a page has more panels."""
@@ -40,7 +41,7 @@ TOLD = {
 
 
 def parameter_plot(
-    rows: pl.DataFrame, drift: Mapping[str, Mapping[str, Any]], vehicle_id: str, name: str, anchor: str, most: int
+    rows: pl.DataFrame, drift: Mapping[str, Row], vehicle_id: str, name: str, anchor: str, most: int
 ) -> Plot:
     """One parameter of one triad, a row of panels an axis: against time, and (where logged) against temperature.
 
@@ -67,7 +68,7 @@ def parameter_plot(
     return Plot(anchor, svg(figure, anchor, name, description), " ".join(sentences))
 
 
-def _panel_row(axes: Any, rows: pl.DataFrame, trend: Mapping[str, Any] | None, vehicle_id: str) -> set[str]:
+def _panel_row(axes: Any, rows: pl.DataFrame, trend: Row | None, vehicle_id: str) -> set[str]:
     """One axis; what its caption has to tell."""
     trend = None if trend is None or trend["value_at_25degc"] is None else trend
     told = {"plain" if trend is None else "trend"}

@@ -12,7 +12,7 @@ from fieldcal.estimation import wahba
 from fieldcal.estimation.faults import Fault
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, from_matrix, multiply
-from fieldcal.names import VECTOR_SENSORS, Sensor, Status
+from fieldcal.names import VECTOR_SENSORS, Json, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables, spread_of
 from fieldcal.stages.results import StageResult, fault_rows
@@ -109,7 +109,7 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
     scatter = float(np.percentile(np.abs(dip - np.median(dip)), 90))
     expected_dip = float(np.degrees(np.arcsin(np.clip(reference[0, 2] / strength, -1, 1))))
     dip_deg = float(np.median(dip))
-    measured: dict[str, object] = {
+    measured: dict[str, Json] = {
         "logged_values_used": fallback,
         "direction_sd_rad": {"magnetometer": float(sigma[0]), "accelerometer": float(sigma[1])},
         "dip_deg": dip_deg,
@@ -154,7 +154,7 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
 
 
 def _contradiction(
-    code: ReasonCode, number: float, limit: float, reason: str, measured: dict[str, object]
+    code: ReasonCode, number: float, limit: float, reason: str, measured: dict[str, Json]
 ) -> StageResult:
     """A refusal that puts both vector triads in question: which of them is wrong cannot be told."""
     rows = [Fault(name, "", code, number, limit, True, reason) for name in VECTOR_SENSORS]

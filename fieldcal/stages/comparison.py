@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -60,7 +60,7 @@ def verify_fit(tables: Tables, s: VerifySettings) -> StageResult:
     vps = tables.get("vps_aligned")
     vps_t = None if vps is None else seconds(vps["t_ns"], int(samples["t_ns"][0]))
     axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, str | float | None]] = []
 
     def add(quantity: str, method: str, reference: str, signal: str, fit: Fit, unit: str, sample: str = "all") -> None:
         rows.append(_fit_row(quantity, method, reference, signal, sample, fit, unit))
@@ -120,7 +120,7 @@ def verify_fit(tables: Tables, s: VerifySettings) -> StageResult:
 
 def _fit_row(
     quantity: str, method: str, reference: str, signal: str, sample: str, fit: Fit, unit: str
-) -> dict[str, Any]:
+) -> dict[str, str | float | None]:
     parts = [v if np.isfinite(v) else None for v in (fit.bias, fit.variance, fit.covariance)]
     return dict(
         zip(

@@ -16,7 +16,7 @@ from fieldcal.estimation.statistics import white_noise_sigma
 from fieldcal.estimation.uncertainty_propagation import attitude_jacobian, constants_to_equation, constants_to_gyro
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import VECTOR_SENSORS, Method, Sensor, Status
+from fieldcal.names import VECTOR_SENSORS, Json, Method, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import body_vectors, known_vectors, logged_constants, sensor_attitude
 from fieldcal.stages.inputs import (
@@ -107,7 +107,7 @@ def _equation_error(tables: Tables, s: GyroEquationSettings, triads: TriadUncert
     rate = fit.scale * logged + fit.bias
     only_scalar = q if s.equations == "scalar" else None
     covariance = fit.covariance + constants_to_equation(logged, rate, weight, pairs, only_scalar)
-    measured = {
+    measured: dict[str, Json] = {
         "residual_rms": fit.residual_rms,
         "noise_share_of_regressor": [float(v) for v in noise_variance / logged.var(axis=0)],
     }
@@ -115,7 +115,7 @@ def _equation_error(tables: Tables, s: GyroEquationSettings, triads: TriadUncert
 
 
 def _gyro_result(
-    method: Method, fit: GyroFit, covariance: Array, tables: Tables, s: GyroSettings, measured: dict[str, Any]
+    method: Method, fit: GyroFit, covariance: Array, tables: Tables, s: GyroSettings, measured: dict[str, Json]
 ) -> StageResult:
     """Gyroscope rows with a status by axis: sign against polarity, size against nominal, claimed sd."""
     relative = np.sqrt(np.diagonal(covariance)[:3]) / np.abs(fit.scale)
@@ -221,7 +221,7 @@ def _output_error(tables: Tables, s: GyroOutputSettings) -> StageResult:
     except EstimationError as error:
         return refusal(error, "gyroscope")
     median = output_error.attitude_error_median(t, q, fit.scale * logged + fit.bias, segment, stretch_s, weight)
-    measured: dict[str, Any] = {
+    measured: dict[str, Json] = {
         "stretch_s": stretch_s,
         "attitude_error_rms_deg": float(np.degrees(fit.residual_rms)),
         "attitude_error_median_deg": float(np.degrees(median)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -14,7 +14,7 @@ from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.statistics import robust_sigma
 from fieldcal.geometry.rotation import Array
 from fieldcal.geometry.sensor_model import default_reference_reading
-from fieldcal.names import Sensor, Status
+from fieldcal.names import Json, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.results import StageResult, fatal_fault
 
@@ -64,7 +64,7 @@ def spread_of(excess: Array) -> float:
     return max(robust_sigma(excess - np.median(excess)), 1e-4)
 
 
-def refusal(error: Exception, name: str, measured: Mapping[str, Any] | None = None) -> StageResult:
+def refusal(error: Exception, name: str, measured: Mapping[str, Json] | None = None) -> StageResult:
     """A refusal without a result, from whatever the numerics raised."""
     code = error.reason_code if isinstance(error, FieldcalError) else ReasonCode.UNUSABLE_READINGS
     return StageResult(

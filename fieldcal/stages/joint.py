@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -18,7 +18,7 @@ from fieldcal.estimation.joint.problem import TERMS, Readings
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array, from_matrix, multiply
-from fieldcal.names import SENSORS, Approach, Method, Sensor, Status
+from fieldcal.names import SENSORS, Approach, Json, Method, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Tables, is_sound, mean_temperature, reference_reading, refusal
@@ -27,6 +27,7 @@ from fieldcal.stages.results import StageResult, fatal_fault, triad_rows, zero_s
 from fieldcal.stages.tables import (
     AXES,
     QUATERNION,
+    CalibrationRow,
     calibration_rows,
     columns_of,
     constants,
@@ -186,7 +187,7 @@ def start_constants(tables: Tables, s: JointSettings, readings: Readings) -> dic
 
 def _written(fit: JointFit, tables: Tables, s: JointSettings, axes: Array) -> StageResult:
     """Rows with a status by sensor and axis, the attitude, the covariance, and the numbers that decided."""
-    rows: list[dict[str, Any]] = []
+    rows: list[CalibrationRow] = []
     codes: dict[Sensor, list[ReasonCode | None]] = {}
     for name in chosen(s):
         if name not in fit.layout:
@@ -238,7 +239,7 @@ def triad_of(fit: JointFit, name: str) -> tuple[Array, Array, Array, Array | Non
 
 def _slope_rows(
     fit: JointFit, tables: Tables, s: JointSettings, codes: list[ReasonCode | None]
-) -> list[dict[str, Any]]:
+) -> list[CalibrationRow]:
     """The gyroscope's zero against temperature, where the flight shows it."""
     if "gyroscope_temperature" not in fit.layout:
         return []
@@ -346,13 +347,13 @@ def passing_field_share(fit: JointFit) -> float:
     return float(1.0 - fit.model.triads["magnetometer"].valid.sum() / given.sum())
 
 
-def _measured(fit: JointFit, axes: Array) -> dict[str, Any]:
-    relative = {}
+def _measured(fit: JointFit, axes: Array) -> dict[str, Json]:
+    relative: dict[str, list[float]] = {}
     for name in SENSORS:
         if name in fit.layout:
             scale, _, covariance = fit.constants(name)
             relative[name] = [float(v) for v in np.sqrt(np.diagonal(covariance)[:3]) / np.abs(scale)]
-    measured: dict[str, Any] = {
+    measured: dict[str, Json] = {
         "n_samples": len(fit.model.readings.t),
         "iterations": fit.iterations,
         "scale_relative_sd": relative,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from fieldcal.estimation.joint.fit import JointFit, fit_joint
 from fieldcal.estimation.joint.pose_measurement import VpsRecord
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, continuous, to_rotation_vector
+from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import sensor_attitude
 from fieldcal.stages.inputs import Tables
@@ -48,7 +49,7 @@ def poses_of(tables: Tables, s: VpsReference) -> Poses | None:
     return Poses(t[keep], continuous(sensor_attitude(q[keep], s)), base_ns * 1e-9, s.vps_max_gap_s)
 
 
-def with_poses(fit: JointFit, poses: Poses | None, s: VpsReference) -> tuple[JointFit, dict[str, Any]]:
+def with_poses(fit: JointFit, poses: Poses | None, s: VpsReference) -> tuple[JointFit, dict[str, Json]]:
     """The fit with the VPS in it, and what was used; as it was, with the reason, where the VPS cannot be used."""
     if poses is None:
         return fit, {"use_vps": False} if s.use_vps else {}
@@ -74,7 +75,7 @@ def with_poses(fit: JointFit, poses: Poses | None, s: VpsReference) -> tuple[Joi
     return replace(own, iterations=fit.iterations + own.iterations), _told(own, vps, poses)
 
 
-def _told(fit: JointFit, vps: VpsRecord, poses: Poses) -> dict[str, Any]:
+def _told(fit: JointFit, vps: VpsRecord, poses: Poses) -> dict[str, Json]:
     lag, skew = vps.clock_of(fit.state.values)
     sd = np.sqrt(np.diagonal(fit.covariance)[fit.layout["vps_clock"]])
     residual, known = vps.residual(fit.model, fit.state)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -14,7 +14,7 @@ from fieldcal.estimation.faults import Fault
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import Sensor
+from fieldcal.names import Json, Sensor
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables, in_used_segments
 from fieldcal.stages.results import fatal_fault
@@ -34,7 +34,7 @@ DRIVES = {"current_a": ("current", "A"), "throttle": ("throttle", "")}
 """What drives the motors, the better one first: column → word and unit."""
 
 
-def check_motor_field(tables: Tables, s: VectorsSettings) -> tuple[dict[str, Any], list[Fault]]:
+def check_motor_field(tables: Tables, s: VectorsSettings) -> tuple[dict[str, Json], list[Fault]]:
     """power, readings and constants of the magnetometer → measured numbers and faults; both empty without a current
     and where the readings are insane already."""
     if not {"power", "readings", "segments"} <= tables.keys():

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from fieldcal.estimation.faults import Fault
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import Method, Sensor, Status
+from fieldcal.names import Json, Method, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.stages.tables import AXES
+from fieldcal.stages.tables import AXES, CalibrationRow
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class StageResult:
     status: Status = Status.OK
     reason_code: ReasonCode | None = None
     reason: str | None = None
-    measured: dict[str, Any] = field(default_factory=dict)
+    measured: Mapping[str, Json] = field(default_factory=dict)
 
 
 ZERO_SLOPE = "zero_per_degc"
@@ -69,7 +69,7 @@ def triad_rows(
     temperature_degc: float | None,
     reason_code: Sequence[ReasonCode | None] = (None, None, None),
     cross_sd: Array | None = None,
-) -> list[dict[str, Any]]:
+) -> list[CalibrationRow]:
     """Rows scale, bias, zero and zero_bias of one triad with their standard deviations.
 
     `scale` (3, 3), `bias` (3,), `covariance` (6, 6) of (λx, λy, λz, bx, by, bz). zero = −b/λ in logged units;
@@ -79,7 +79,7 @@ def triad_rows(
     matrix, b, d0 = (np.asarray(v, dtype=float) for v in (scale, bias, reference_reading))
     divisor = f"({logged_unit})" if "/" in logged_unit else logged_unit
     scale_unit = "1" if unit == logged_unit else f"{unit}/{divisor}"
-    rows: list[dict[str, Any]] = []
+    rows: list[CalibrationRow] = []
 
     def add(parameter: str, axis: str, i: int, value: float, variance: float | None, row_unit: str) -> None:
         finite = variance is not None and np.isfinite(variance) and variance >= 0
@@ -128,7 +128,7 @@ def zero_slope_rows(
     logged_unit: str,
     temperature_degc: float | None,
     reason_code: Sequence[ReasonCode | None] = (None, None, None),
-) -> list[dict[str, Any]]:
+) -> list[CalibrationRow]:
     """Rows zero_per_degc of one triad: slope (3,) of its zero on temperature and sd (3,), logged units per °C; an axis
     with a reason code is refused."""
     unit = f"({logged_unit})/degC" if "/" in logged_unit else f"{logged_unit}/degC"

@@ -15,6 +15,7 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from fieldcal.names import Json
 from fieldcal.provenance.reached_code import reach_digest
 from fieldcal.provenance.source_tree import files_below, installed
 
@@ -25,7 +26,7 @@ LIBRARIES = ("numpy", "scipy", "polars")
 def run_key(
     stage_name: str,
     source: str,
-    params: Mapping[str, Any],
+    params: Mapping[str, Json],
     input_hashes: Mapping[str, str],
 ) -> str:
     """Digest of one execution of a stage: 32 hex digits, the same in every process.

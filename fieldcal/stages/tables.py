@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 import polars as pl
 
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Method, Sensor, Status
+from fieldcal.reason_codes import ReasonCode
 
 AXES = ("x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -35,7 +36,22 @@ def columns_of(array: Array, names: Sequence[str]) -> dict[str, Array]:
     return {name: np.ascontiguousarray(array[:, i]) for i, name in enumerate(names)}
 
 
-def calibration_rows(rows: list[dict[str, Any]]) -> pl.DataFrame:
+class CalibrationRow(TypedDict):
+    """A row of the `calibration` table as a stage writes it."""
+
+    sensor: Sensor
+    method: Method
+    parameter: str
+    axis: str
+    value: float | None
+    sd: float | None
+    unit: str
+    temperature_degc: float | None
+    status: Status
+    reason_code: ReasonCode | None
+
+
+def calibration_rows(rows: list[CalibrationRow]) -> pl.DataFrame:
     """Rows of the `calibration` table as a stage writes it."""
     return pl.DataFrame(
         rows,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -13,7 +13,7 @@ from fieldcal.estimation import ellipsoid, motion_selection
 from fieldcal.estimation.ellipsoid import TriadFit
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import VECTOR_SENSORS, EllipsoidFit, Method, Sensor, Status, Triple
+from fieldcal.names import VECTOR_SENSORS, EllipsoidFit, Json, Method, Sensor, Status, Triple
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import (
@@ -113,7 +113,7 @@ def _smoothed_or(tables: Tables, name: Sensor, logged: Array) -> Array:
 
 
 def _judged(
-    name: Sensor, fit: TriadFit, tables: Tables, s: EllipsoidSettings, unit: str, logged: Array, extra: dict[str, Any]
+    name: Sensor, fit: TriadFit, tables: Tables, s: EllipsoidSettings, unit: str, logged: Array, extra: dict[str, Json]
 ) -> StageResult:
     """Rows of a triad fit, refused ones included, with the numbers that decided."""
     code = reason = None
@@ -163,7 +163,7 @@ def calibrate_accelerometer_gated(tables: Tables, s: GatedAccelerometerSettings)
     if gyro is None and "gyroscope" in tables:
         gyro = constants(tables["gyroscope"], Sensor.GYROSCOPE, refused_too=True)
     logged, smoothed = matrix(samples, triad("accelerometer")), matrix(samples, triad("accelerometer", "smoothed_"))
-    measured: dict[str, Any] = {"lever_arm_applied": s.lever_arm_m is not None and gyro is not None}
+    measured: dict[str, Json] = {"lever_arm_applied": s.lever_arm_m is not None and gyro is not None}
     if gyro is None:
         # Rates in counts: at rest, the one thing that can be told without a scale.
         level, noise = motion_selection.windowed_rate(
@@ -244,6 +244,7 @@ def judge_vectors(tables: Tables, s: VectorsSettings) -> StageResult:
     A fit by length alone cannot see polarity or axes, so where attitude says that they contradict each other neither
     is good."""
     measured, motor_faults = check_motor_field(tables, s)
+    motor = next((fault for fault in motor_faults if fault.code == ReasonCode.MOTOR_FIELD), None)
     faults = fault_rows(motor_faults)
     if "faults" in tables:
         faults = pl.concat([faults, tables["faults"]])
@@ -255,9 +256,8 @@ def judge_vectors(tables: Tables, s: VectorsSettings) -> StageResult:
         if fault is not None:
             code = pl.when(pl.col("status") == Status.OK).then(pl.lit(fault["reason_code"])).otherwise("reason_code")
             parts.append(tables[name].with_columns(status=pl.lit(Status.REFUSED), reason_code=code))
-        elif name == Sensor.MAGNETOMETER and motor_faults and "motor_field" in measured:
-            share = float(measured["motor_field"]["share"])
-            parts.append(_with_motor_field(tables[name], share, float(np.linalg.norm(s.field_ned))))
+        elif name == Sensor.MAGNETOMETER and motor is not None:
+            parts.append(_with_motor_field(tables[name], motor.value, float(np.linalg.norm(s.field_ned))))
         else:
             parts.append(tables[name])
     if not parts:

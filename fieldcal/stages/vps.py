@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -27,7 +27,7 @@ from fieldcal.geometry.rotation import (
     normalise,
     slerp,
 )
-from fieldcal.names import Method, Sensor, Status
+from fieldcal.names import Json, Method, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Tables, is_sound
@@ -68,7 +68,7 @@ def synchronise_vps(tables: Tables, s: VpsSyncSettings) -> StageResult:
     t_vps = seconds(vps["t_ns"], origin + base_ns)
     q_vps = vps_attitude(matrix(vps, QUATERNION), s)
     keep = by_rates.mask_outliers(t_vps, q_vps)
-    measured: dict[str, Any] = {
+    measured: dict[str, Json] = {
         "vps_samples": len(keep),
         "vps_masked": int((~keep).sum()),
         "gyro_calibrated": gyro is not None,
@@ -115,7 +115,7 @@ def synchronise_vps(tables: Tables, s: VpsSyncSettings) -> StageResult:
 
 def _refined(
     fit: by_rates.SyncFit, tables: Tables, s: VpsClock, origin: int, t_vps: Array, q_vps: Array
-) -> tuple[by_rates.SyncFit, dict[str, Any]]:
+) -> tuple[by_rates.SyncFit, dict[str, Json]]:
     """The clock by a sound magnetometer too, and what that found."""
     table = tables.get("magnetometer_log")
     if table is None or table.is_empty() or not is_sound(tables, "magnetometer"):
@@ -132,7 +132,7 @@ def _refined(
     }
 
 
-def _sync_row(values: dict[str, Any]) -> pl.DataFrame:
+def _sync_row(values: dict[str, Json]) -> pl.DataFrame:
     row = dict.fromkeys(SYNC_NUMBERS) | values
     return pl.DataFrame([row], schema={**dict.fromkeys(SYNC_NUMBERS, pl.Float64), "status": pl.String})
 
@@ -162,7 +162,7 @@ def vps_attitude(q: Array, s: VpsAttitude) -> Array:
 
 def _aligned(
     t_vps: Array, q_vps: Array, t_imu: Array, rate: Array, tables: Tables, s: VpsClock, *, calibrated: bool
-) -> tuple[dict[str, Array], dict[str, Any]]:
+) -> tuple[dict[str, Array], dict[str, Json]]:
     """VPS attitude and rate on a uniform grid at its own rate, IMU clock, both constant rotations put in."""
     interval = float(np.median(np.diff(t_vps)))
     rates = by_rates.vps_rates(t_vps, q_vps, interval, max_gap_s=s.vps_max_gap_s)
@@ -191,7 +191,7 @@ def _aligned(
         if near.any():
             world = mean_quaternion(multiply(own_q[near], conjugate(q[near])), trust[near])
             q = multiply(world, q)
-    rotations = {
+    rotations: dict[str, Json] = {
         "vps_body_rotation_deg": float(np.degrees(2 * np.arccos(np.clip(abs(body[3]), 0, 1)))),
         "vps_world_rotation_deg": float(np.degrees(2 * np.arccos(np.clip(abs(world[3]), 0, 1)))),
     }

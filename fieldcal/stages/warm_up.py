@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from fieldcal.names import Method, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables, is_sound
 from fieldcal.stages.results import ZERO_SLOPE, StageResult, zero_slope_rows
-from fieldcal.stages.tables import calibration_rows, constants, matrix, seconds, triad
+from fieldcal.stages.tables import CalibrationRow, calibration_rows, constants, matrix, seconds, triad
 
 if TYPE_CHECKING:
     from fieldcal.config.stage_settings import WarmUpSettings
@@ -57,7 +57,7 @@ def find_warm_up(tables: Tables, s: WarmUpSettings) -> StageResult:
     return StageResult({"calibration": calibration_rows(rows)}, measured=measured)
 
 
-def _rows(sensor: Sensor, found: warm_up.WarmUp, s: WarmUpSettings) -> list[dict[str, Any]]:
+def _rows(sensor: Sensor, found: warm_up.WarmUp, s: WarmUpSettings) -> list[CalibrationRow]:
     return zero_slope_rows(
         sensor,
         METHOD,

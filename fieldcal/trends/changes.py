@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import polars as pl
 
@@ -24,6 +24,18 @@ TELLING = ("zero_bias", "zero", "scale", "bias")
 SERIES = ["imu_id", "sensor", "method", "parameter", "axis"]
 
 
+class PlainChange(TypedDict):
+    """A `Change` as plain JSON."""
+
+    kind: str
+    vehicle_id: str
+    imu_id: str | None
+    sensor: str | None
+    axis: str | None
+    parameters: list[str]
+    sentence: str
+
+
 @dataclass(frozen=True)
 class Change:
     """One thing to tell, `sentence` for people. `parameters` of an axis that say the same are told together."""
@@ -36,9 +48,17 @@ class Change:
     parameters: tuple[str, ...]
     sentence: str
 
-    def row(self) -> dict[str, Any]:
+    def row(self) -> PlainChange:
         """As a JSON object."""
-        return asdict(self) | {"parameters": list(self.parameters)}
+        return {
+            "kind": self.kind,
+            "vehicle_id": self.vehicle_id,
+            "imu_id": self.imu_id,
+            "sensor": self.sensor,
+            "axis": self.axis,
+            "parameters": list(self.parameters),
+            "sentence": self.sentence,
+        }
 
 
 def changes(

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from fieldcal.names import DriftStatus
 from fieldcal.schemas.reference import UNCONFIRMED_SD
 from fieldcal.trends.series import ENOUGH_SESSIONS
 from fieldcal.words.numbers import number, with_sd
+from fieldcal.words.rows import Row
 
 VPS, AGREEMENT = "vps", "fit"
 """What stands as `sensor` of rows about the VPS clock and about agreement (Theil's coefficients)."""
 
 
-def reason(row: Mapping[str, Any]) -> str | None:
+def reason(row: Row) -> str | None:
     """The sentence; None for a stable row whose last flight lies where it should."""
     unit = "" if row["unit"] in (None, "1") else f" {row['unit']}"
     if row["status"] == DriftStatus.INSUFFICIENT:

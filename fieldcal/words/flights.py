@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from fieldcal.names import Status, Verdict
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.words.numbers import number, with_sd
+from fieldcal.words.rows import Row
 
 QUANTITIES = {
     "attitude": "attitude",
@@ -15,10 +15,10 @@ QUANTITIES = {
     "attitude_propagated": "integrated attitude",
     "body_rate": "body rate",
 }
-Rows = Sequence[Mapping[str, Any]]
+Rows = Sequence[Row]
 
 
-def verdict_sentence(flight: Mapping[str, Any]) -> str:
+def verdict_sentence(flight: Row) -> str:
     """What became of the log, in a line."""
     head = f"{flight['log_uri']} ({flight['vehicle_id']}, flight {flight['flight_id']}): {flight['verdict']}"
     if Verdict(flight["verdict"]).usable:
@@ -36,7 +36,7 @@ def advised(runs: Rows) -> list[str]:
     return [run["measured"]["advice"] for run in runs if run["status"] == Status.OK and run["measured"].get("advice")]
 
 
-def is_consequence(run: Mapping[str, Any]) -> bool:
+def is_consequence(run: Row) -> bool:
     """Whether a stage stopped only because another stage gave it nothing: `no_` and one of the tables that it needs.
 
     The same code is a cause where a stage finds it in the log itself: equation error's `no_gyroscope`."""
@@ -48,7 +48,7 @@ def is_consequence(run: Mapping[str, Any]) -> bool:
     return bool(run["status"] == Status.REFUSED and wanting)
 
 
-def sync_sentence(sync: Mapping[str, Any]) -> str:
+def sync_sentence(sync: Row) -> str:
     """The clocks in a line."""
     if sync["status"] != Status.OK:
         return f"VPS clock: {sync['status']}; peak {number(sync['peak'], 3)}, next best {number(sync['runner_up'], 3)}"

@@ -11,13 +11,16 @@ if TYPE_CHECKING:
 
 NESTED = ("measured", "versions", "findings")
 
+Row = Mapping[str, Any]
+"""A row of a table, column → value: what polars gives is of the column's type."""
 
-def rows_of(frame: pl.DataFrame) -> list[dict[str, Any]]:
+
+def rows_of(frame: pl.DataFrame) -> list[Row]:
     """Rows as objects; what is not a finite number is null."""
     return [{name: _finite(value) for name, value in row.items()} for row in frame.iter_rows(named=True)]
 
 
-def unfolded(row: Mapping[str, Any]) -> dict[str, Any]:
+def unfolded(row: Row) -> dict[str, Any]:
     """A row whose JSON texts (`measured`, `versions`, `findings`) are objects."""
     return {k: json.loads(v) if k in NESTED and isinstance(v, str) else v for k, v in row.items()}
 

@@ -139,8 +139,6 @@ def test_the_stage_tells_of_a_resting_accelerometer() -> None:
         logged_unit="m/s^2",
         reference_reading=np.zeros(3),
         temperature_degc=25.0,
-        status=("ok",) * 3,
-        reason_code=(None,) * 3,
     )
     tables = {
         "imu": imu,

@@ -85,13 +85,13 @@ def test_age_is_told_when_it_passes_the_limit(tmp_path: Path) -> None:
 
 def test_trends_of_another_release_are_made_anew(tmp_path: Path) -> None:
     publish_fleet(tmp_path, units=2, sessions=6)
-    close_night(tmp_path, Alerts(1e5, 1e5))
+    close_night(tmp_path, Alerts(expires_days=1e5, idle_days=1e5))
     made = Warehouse(tmp_path).scan("drift").collect()
     (path, *_) = history_files(tmp_path, "drift")
     table = pq.read_table(path)
     other = {**(table.schema.metadata or {}), VERSION_KEY.encode(): b"2"}
     pq.write_table(table.drop_columns(["best_known_at"]).replace_schema_metadata(other), path)
-    close_night(tmp_path, Alerts(1e5, 1e5))
+    close_night(tmp_path, Alerts(expires_days=1e5, idle_days=1e5))
     assert Warehouse(tmp_path).scan("drift").collect().equals(made)
 
 

@@ -22,6 +22,7 @@ from fieldcal.estimation.joint.pose_measurement import PARAMETERS, VpsRecord
 from fieldcal.estimation.joint.problem import TERMS, Model, State
 from fieldcal.estimation.joint.variance_components import Levels, robust_weight
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import Json
 
 # Score test: χ² exceeded by chance once in a thousand, by degrees of freedom.
 SCORE_CHI2 = {1: 10.8, 3: 16.3, 6: 22.5}
@@ -210,9 +211,9 @@ def _gain(model: Model, without: _Prediction, term: _Prediction) -> float:
     return float(drop.sum()) / sd if sd > 0.0 else 0.0
 
 
-def summary(tests: list[TermTest], fit: JointFit) -> Mapping[str, dict[str, object]]:
+def summary(tests: list[TermTest], fit: JointFit) -> Mapping[str, Mapping[str, Json]]:
     """Plain numbers for `measured`: the test results of each term and, where kept, its values and sd."""
-    out: dict[str, dict[str, object]] = {}
+    out: dict[str, dict[str, Json]] = {}
     for test in tests:
         out[test.name] = {"kept": test.kept, "score": test.score, "held_out_gain": test.gain}
         if test.kept:
