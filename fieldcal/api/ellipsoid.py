@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from fieldcal.estimation import ellipsoid
 from fieldcal.estimation.ellipsoid import TriadFit
+from fieldcal.estimation.ellipsoid_refusals import require_determined
 from fieldcal.geometry.rotation import Array
 
 if TYPE_CHECKING:
@@ -145,5 +146,5 @@ def fit_ellipsoid(
     """
     z = np.asarray(measured, dtype=float)
     fit = ellipsoid.fit_ellipsoid(z, magnitude, method=method, polarity=polarity)
-    ellipsoid.require_determined(fit, max_condition=max_condition, max_scale_sd=max_scale_sd, max_residual=max_residual)
+    require_determined(fit, max_condition=max_condition, max_scale_sd=max_scale_sd, max_residual=max_residual)
     return EllipsoidFit(**vars(fit), readings=z, magnitude=float(magnitude))

@@ -1,19 +1,21 @@
 """Scale and bias of a triad from readings of a vector of known length (magnetometer, accelerometer): Eq. 5–8.
 
-Turned through many attitudes, an ideal triad draws a sphere of radius f; scale and bias make it an ellipsoid. Four
-algebraic fits (`li`, `li_full`, `two_step`, `tls`) and the statistical refinement (`robust`, the default) share one
-entry, `fit_ellipsoid`, one covariance and one refusal, `require_determined`.
+Turned through many attitudes, an ideal triad draws a sphere of radius f; scale and bias make it an ellipsoid. Three
+algebraic fits (`li`, `li_full`, `tls`: see `quadric`) and two that minimise distances (`two_step` and, robust and the
+default, `robust`) share one entry, `fit_ellipsoid`, one covariance and one refusal (`ellipsoid_refusals`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldcal.errors import EstimationError, UnusableFlight
+from fieldcal.estimation import quadric
 from fieldcal.estimation.statistics import (
     huber_inflation,
     huber_weights,
@@ -25,14 +27,10 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
 
-# Li and Griffiths' constraint 4J − I² > 0 on (θ1, θ2, θ3), and its inverse.
-C1 = np.array([[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0]])
-C1_INVERSE = 0.5 * np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 0.0]])
-
 
 @dataclass(frozen=True)
 class TriadFit:
-    """A triad's calibration z = Λ z_d + b and what is known of it.
+    """A triad's calibration z = Λ z_d + b and its uncertainty.
 
     `scale` (3, 3) is Λ, diagonal but for `li_full`, polarity included; `bias` (3,) in the field's unit. `covariance`
     (6, 6) of (λx, λy, λz, bx, by, bz), coloured-residual form; `covariance_white` its Cramér–Rao form. `residual_rms`
@@ -106,7 +104,7 @@ def fit_ellipsoid(
 
     Notes
     -----
-    Whether the result is good enough is `require_determined`'s question.
+    Whether the result is good enough is decided by `ellipsoid_refusals.require_determined`.
 
     References
     ----------
@@ -156,102 +154,23 @@ def _noise_shape(z: Array) -> Array:
 Solution = tuple[Array, Array, Array, int]  # Λ (3, 3), b (3,) for unit radius; robust weights (n,); iterations
 
 
-def _quadric_to_triad(theta: Array, offset: float) -> tuple[Array, Array]:
-    """Λ and b for unit radius from the quadric xᵀQx + 2pᵀx + θ10 = 0 (Eq. 7–8 with the bracket's θ10 undivided)."""
-    q = np.array(
-        [[theta[0], theta[5], theta[4]], [theta[5], theta[1], theta[3]], [theta[4], theta[3], theta[2]]], dtype=float
-    )
-    p = theta[6:9]
-    if np.trace(q) < 0:
-        q, p, offset = -q, -p, -offset
-    lengths, axes = np.linalg.eigh(q)
-    if lengths[0] <= 1e-12 * lengths[2]:
-        raise UnusableFlight(
-            ReasonCode.ELLIPSOID_DEGENERATE,
-            "The readings lie on a plane or an open surface, not an ellipsoid: turn through more attitudes.",
-            {"quadric_eigenvalues": [float(v) for v in lengths]},
-        )
-    to_centre = np.linalg.solve(q, p)
-    g = float(p @ to_centre - offset)  # G of Eq. 7–8
-    if g <= 0:
-        raise UnusableFlight(
-            ReasonCode.ELLIPSOID_DEGENERATE, "The fitted quadric has no real points: too little motion."
-        )
-    scale = (axes * np.sqrt(lengths / g)) @ axes.T  # λ_i = f √(θ_i/G); f = 1
-    return scale, scale @ to_centre  # b_i = λ_i θ_{i+6}/θ_i
-
-
-def _li_griffiths(x: Array, *, full: bool = False) -> Solution:
-    """Li and Griffiths' constrained eigenproblem on S = DᵀD in blocks."""
-    x1, x2, x3 = x.T
-    squares = [x1 * x1, x2 * x2, x3 * x3]
-    if full:
-        squares += [2 * x2 * x3, 2 * x1 * x3, 2 * x1 * x2]
-    m = len(squares)
-    d = np.stack([*squares, 2 * x1, 2 * x2, 2 * x3, np.ones(len(x))], axis=1)
-    s = d.T @ d
-    s11, s12, s22 = s[:m, :m], s[:m, m:], s[m:, m:]
-    inverse = np.zeros((m, m))
-    inverse[:3, :3] = C1_INVERSE
-    inverse[range(3, m), range(3, m)] = -0.25
+def _robust(x: Array) -> Solution:
+    """Huber-weighted refinement of the lengths, in logged units."""
     try:
-        lower = np.linalg.solve(s22, s12.T)
-    except np.linalg.LinAlgError as error:
-        raise UnusableFlight(
-            ReasonCode.ELLIPSOID_DEGENERATE, "The readings lie in a plane: turn about more axes."
-        ) from error
-    values, vectors = np.linalg.eig(inverse @ (s11 - s12 @ lower))
-    v1 = vectors[:, int(np.argmax(values.real))].real  # the largest, not "the positive one"
-    v2 = -lower @ v1
-    theta = np.zeros(9)
-    theta[:m] = v1
-    theta[6:] = v2[:3]
-    scale, bias = _quadric_to_triad(theta, float(v2[3]))
-    return scale, bias, np.ones(len(x)), 1
-
-
-def _li_full(x: Array) -> Solution:
-    return _li_griffiths(x, full=True)
-
-
-def _tls(x: Array) -> Solution:
-    """Total least squares: smallest right singular vector of the column-scaled quadric regressors."""
-    d = np.column_stack([x * x, 2 * x, np.ones(len(x))])
-    norms = np.linalg.norm(d, axis=0)
-    norms[norms == 0.0] = 1.0  # a stuck axis has none
-    theta = np.linalg.svd(d / norms, full_matrices=False)[2][-1] / norms
-    scale, bias = _quadric_to_triad(np.concatenate([theta[:3], np.zeros(3), theta[3:6]]), float(theta[6]))
-    return scale, bias, np.ones(len(x)), 1
+        start = quadric.li_griffiths(x)
+    except UnusableFlight:
+        start = quadric.sphere(x)
+    return _gauss_newton(x, *start, robust=True)
 
 
 def _two_step(x: Array) -> Solution:
     """Gebre-Egziabher's two steps: linear least squares on Hx², then Gauss–Newton on the lengths themselves."""
-    x1, x2, x3 = x.T
-    regressors = np.column_stack([2 * x1, -x2 * x2, 2 * x2, -x3 * x3, 2 * x3, np.ones(len(x))])
-    t = np.linalg.lstsq(regressors, x1 * x1, rcond=None)[0]
-    theta = np.array([1.0, t[1], t[3], 0, 0, 0, -t[0], -t[2], -t[4]])
-    scale, bias = _quadric_to_triad(theta, -float(t[5]))
-    return _gauss_newton(x, scale, bias, robust=False)
+    return _gauss_newton(x, *quadric.first_step(x), robust=False)
 
 
-def _robust(x: Array) -> Solution:
-    """Huber-weighted refinement of the lengths, in logged units."""
-    try:
-        scale, bias, _, _ = _li_griffiths(x)
-    except UnusableFlight:
-        scale, bias, _, _ = _sphere(x)
-    return _gauss_newton(x, scale, bias, robust=True)
-
-
-def _sphere(x: Array) -> Solution:
-    """Linear least-squares sphere: the start where the ellipsoid's own algebra finds no ellipsoid."""
-    d = np.column_stack([2 * x, np.ones(len(x))])
-    t, _, rank, _ = np.linalg.lstsq(d, np.sum(x * x, axis=1), rcond=None)
-    radius_squared = float(t[3] + t[:3] @ t[:3])
-    if rank < 4 or radius_squared <= 0:
-        raise UnusableFlight(ReasonCode.ELLIPSOID_DEGENERATE, "The readings lie in a plane: turn about more axes.")
-    radius = np.sqrt(radius_squared)
-    return np.eye(3) / radius, -t[:3] / radius, np.ones(len(x)), 1
+def _algebraic(fit: Callable[[Array], quadric.Triad], x: Array) -> Solution:
+    """An algebraic fit as it is: every reading of weight 1, no iteration."""
+    return *fit(x), np.ones(len(x)), 1
 
 
 # Clipping Gaussian residuals would cost 5 % of the information for nothing: robust weights are for records with more
@@ -344,15 +263,15 @@ def _gauss_newton(rows: Array, scale: Array, bias: Array, *, robust: bool, max_i
 
 METHODS: dict[str, Callable[[Array], Solution]] = {
     "robust": _robust,
-    "li": _li_griffiths,
-    "li_full": _li_full,
+    "li": partial(_algebraic, quadric.li_griffiths),
+    "li_full": partial(_algebraic, partial(quadric.li_griffiths, full=True)),
     "two_step": _two_step,
-    "tls": _tls,
+    "tls": partial(_algebraic, quadric.total_least_squares),
 }
 
 
 def _with_statistics(rows: Array, scale: Array, bias: Array, weight: Array, iterations: int) -> TriadFit:
-    """Covariance at the solution, in scaled coordinates. Cross terms of `li_full` are taken as known."""
+    """Covariance at the solution, in scaled coordinates. Cross terms of `li_full` are taken as exact."""
     x = np.ascontiguousarray(rows.T)
     at = _distances(x, scale, bias)
     root = np.sqrt(weight)
@@ -404,55 +323,3 @@ def _in_logged_units(fit: TriadFit, centre: Array, spread: Array, magnitude: flo
         covariance=transform @ fit.covariance @ transform.T,
         covariance_white=transform @ fit.covariance_white @ transform.T,
     )
-
-
-def require_determined(
-    fit: TriadFit,
-    *,
-    max_condition: float,
-    max_scale_sd: float,
-    max_residual: float,
-    nominal_scale: ArrayLike | None = None,
-) -> None:
-    """Refuse a calibration that the recording does not determine.
-
-    Checks, all four: condition number, claimed relative sd of the scales, rms of |z|/f − 1, and (where a nominal scale
-    is known) each scale within a factor of two of it. At a collapsed solution any one of them alone can look healthy.
-
-    Raises
-    ------
-    UnusableFlight
-        `too_little_motion`, `scale_uncertain`, `not_a_sphere` or `scale_not_nominal`; `measured` has all the numbers.
-    """
-    measured = fit.measured()
-    relative = max(fit.scale_relative_sd)
-    if not fit.condition <= max_condition:
-        raise UnusableFlight(
-            ReasonCode.TOO_LITTLE_MOTION,
-            f"Too little of the sphere was seen: condition number {fit.condition:.3g}, at most {max_condition:.3g} is"
-            " accepted. Tilt the vehicle further about every axis.",
-            measured,
-        )
-    if nominal_scale is not None:
-        ratio = np.abs(fit.scale_diagonal) / np.abs(np.asarray(nominal_scale, dtype=float))
-        measured["scale_over_nominal"] = [float(v) for v in ratio]
-        if (ratio < 0.5).any() or (ratio > 2.0).any():
-            raise UnusableFlight(
-                ReasonCode.SCALE_NOT_NOMINAL,
-                f"A scale is {ratio.min():.3g} to {ratio.max():.3g} times its nominal value, outside 0.5 to 2: wrong"
-                " unit, wrong field strength, or a collapsed fit.",
-                measured,
-            )
-    if not relative <= max_scale_sd:
-        raise UnusableFlight(
-            ReasonCode.SCALE_UNCERTAIN,
-            f"A scale is uncertain by {100 * relative:.3g} % (one sd); at most {100 * max_scale_sd:.3g} % is accepted.",
-            measured,
-        )
-    if not fit.residual_rms <= max_residual:
-        raise UnusableFlight(
-            ReasonCode.NOT_A_SPHERE,
-            f"The calibrated length varies by {100 * fit.residual_rms:.3g} % rms, above {100 * max_residual:.3g} %:"
-            " another field or other accelerations were sensed.",
-            measured,
-        )

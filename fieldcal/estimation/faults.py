@@ -1,4 +1,4 @@
-"""What the readings of a triad give away by themselves: dead, stuck, clipped or random channels, a wrong unit.
+"""Faults that the readings of a triad show without a fit: dead, stuck, clipped or random channels, a wrong unit.
 
 Every check is a number against a limit. Limits are wide: what passes here may still be refused by the fits, but what
 fails here is not worth a fit. Readings are as logged, (n, 3); stamps in seconds, increasing.
@@ -17,13 +17,17 @@ from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
 
 AXES = "xyz"
-TEN_SAMPLES = 10
+FEWEST_SAMPLES = 10
+"""Fewer readings are not checked."""
 
 STUCK_S = 1.0
-"""A channel that lives changes within a second."""
+"""A working channel changes within a second."""
 
-STUCK_TIMES = 50.0
-"""A stuck channel holds a value so many times longer than it does otherwise (99th percentile of holding times)."""
+STUCK_RATIO = 50.0
+"""A stuck channel holds a value so many times longer than it does otherwise (99th percentile of holding times …"""
+
+HOLDS_LEFT_OUT = 10
+"""… without so many of the longest, which may be those of a stuck channel)."""
 
 STUCK_SHARE = 0.02
 """Share of the recording that may be stuck."""
@@ -31,16 +35,19 @@ STUCK_SHARE = 0.02
 CLIPPED_RATIO = 3.0
 """A rail holds so many times the samples of the three levels before it together; a smooth peak holds as many."""
 
+CLIPPED_SAMPLES = 10
+"""Fewer samples at an extreme value show no rail."""
+
 CLIPPED_SHARE = 1e-3
 """Share of samples at a rail beyond which a fit is biased."""
 
-LEVELS = 20
+CLIPPED_LEVELS = 20
 """Fewer different values show no rail."""
 
 WHITE_RATIO = 0.8
 """Successive readings of a moving body resemble each other: variance of their differences over twice the variance."""
 
-LOUD = {"gyroscope": 5.0, "accelerometer": 20.0}
+LARGEST_NOISE_SI = {"gyroscope": 5.0, "accelerometer": 20.0}
 """Standard deviation, rad/s and m/s², beyond which noise is no sensor's."""
 
 GRAVITY_RATIO = (0.5, 2.0)
@@ -53,11 +60,15 @@ EARTH_FIELD_T = 45e-6
 FASTEST_RADPS = 70.0
 """Twice the widest range of common gyroscopes (2000 °/s)."""
 
-RATE_WINDOW_S = 5.0
-RATE_CHANGE = 1.3
-GAP_INTERVALS = 1.5
-PAUSE_S = 1.0
-"""Longer ones are no dropouts but pauses, which ingest tells of."""
+RATE_WINDOW_S, RATE_WINDOW_SAMPLES = 5.0, 10
+RATE_CHANGE_RATIO = 1.3
+"""Fastest over slowest sampling rate, each the median of a window with so many samples at least."""
+
+DROPOUT_INTERVALS, LONGEST_DROPOUT_S = 1.5, 1.0
+"""Samples are missing where stamps are further apart; longer ones are pauses, which ingest reports."""
+
+DROPOUT_SHARE = 1e-3
+"""Share of missing samples beyond which dropouts are reported."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +98,7 @@ def channel_faults(sensor: str, t: ArrayLike, logged: ArrayLike, unit: str, si_s
     t : (n,) array
         Stamps, s.
     logged : (n, 3) array
-        Readings; n ≥ 10.
+        Readings; n ≥ FEWEST_SAMPLES.
     unit : str
         Unit of the readings, for sentences.
     si_scale : float or None
@@ -101,8 +112,8 @@ def channel_faults(sensor: str, t: ArrayLike, logged: ArrayLike, unit: str, si_s
             faults.append(dead)
             continue
         faults += [f for f in (_stuck(sensor, axis, t, x[:, i], unit), _clipped(sensor, axis, x[:, i], unit)) if f]
-        if si_scale is not None and sensor in LOUD:
-            random = _random(sensor, axis, x[:, i] * si_scale, LOUD[sensor])
+        if si_scale is not None and sensor in LARGEST_NOISE_SI:
+            random = _random(sensor, axis, x[:, i] * si_scale, LARGEST_NOISE_SI[sensor])
             faults += [random] if random else []
     return faults
 
@@ -120,8 +131,8 @@ def _stuck(sensor: str, axis: str, t: Array, x: Array, unit: str) -> Fault | Non
     start = run_starts(x)
     end = np.r_[start[1:], len(x)] - 1
     held = t[end] - t[start]
-    usual = float(np.quantile(np.sort(held)[: max(1, len(held) - TEN_SAMPLES)], 0.99))
-    limit = max(STUCK_S, STUCK_TIMES * usual)
+    usual = float(np.quantile(np.sort(held)[: max(1, len(held) - HOLDS_LEFT_OUT)], 0.99))
+    limit = max(STUCK_S, STUCK_RATIO * usual)
     stuck = held > limit
     if not stuck.any():
         return None
@@ -136,10 +147,10 @@ def _stuck(sensor: str, axis: str, t: Array, x: Array, unit: str) -> Fault | Non
 def _clipped(sensor: str, axis: str, x: Array, unit: str) -> Fault | None:
     """A rail: an extreme value that is met far more often than the values just before it."""
     levels, counts = np.unique(x, return_counts=True)
-    if len(levels) < LEVELS:
+    if len(levels) < CLIPPED_LEVELS:
         return None
     ends = ((levels[-1], counts[-1], counts[-4:-1]), (levels[0], counts[0], counts[1:4]))
-    rails = [(level, n) for level, n, before in ends if n >= TEN_SAMPLES and n > CLIPPED_RATIO * before.sum()]
+    rails = [(level, n) for level, n, before in ends if n >= CLIPPED_SAMPLES and n > CLIPPED_RATIO * before.sum()]
     if not rails:
         return None
     at = int(sum(n for _, n in rails))
@@ -150,7 +161,7 @@ def _clipped(sensor: str, axis: str, x: Array, unit: str) -> Fault | None:
 
 
 def _random(sensor: str, axis: str, x: Array, loud: float) -> Fault | None:
-    """Successive readings that know nothing of each other, far louder than any sensor's noise."""
+    """Successive readings that are uncorrelated and scatter far more than any sensor's noise."""
     spread = float(np.std(x))
     ratio = float(np.mean(np.diff(x) ** 2) / (2.0 * spread**2))
     if spread < loud or ratio < WHITE_RATIO:
@@ -224,28 +235,36 @@ def sampling_faults(sensor: str, t: ArrayLike) -> list[Fault]:
     step = np.diff(t)
     interval = float(np.median(step))
     faults = []
-    lost = (step > GAP_INTERVALS * interval) & (step <= PAUSE_S)
+    lost = (step > DROPOUT_INTERVALS * interval) & (step <= LONGEST_DROPOUT_S)
     missing = float(np.rint(step[lost] / interval - 1.0).sum())
     share = missing / (len(t) + missing)
-    if share > CLIPPED_SHARE:
+    if share > DROPOUT_SHARE:
         sentence = (
             f"The {sensor} lost about {missing:.0f} samples ({100 * share:.2f} %) in {int(lost.sum())} dropouts, the"
             f" longest {step[lost].max():.3f} s."
         )
-        faults.append(Fault(sensor, "", ReasonCode.DROPOUTS, share, CLIPPED_SHARE, False, sentence))
+        faults.append(Fault(sensor, "", ReasonCode.DROPOUTS, share, DROPOUT_SHARE, False, sentence))
     rates = _windowed_rates(t)
-    if len(rates) > 1 and rates.max() > RATE_CHANGE * rates.min():
+    if len(rates) > 1 and rates.max() > RATE_CHANGE_RATIO * rates.min():
         sentence = f"The {sensor}'s rate changes between {rates.min():.4g} and {rates.max():.4g} Hz."
         faults.append(
-            Fault(sensor, "", ReasonCode.RATE_CHANGES, float(rates.max() / rates.min()), RATE_CHANGE, False, sentence)
+            Fault(
+                sensor,
+                "",
+                ReasonCode.RATE_CHANGES,
+                float(rates.max() / rates.min()),
+                RATE_CHANGE_RATIO,
+                False,
+                sentence,
+            )
         )
     return faults
 
 
 def _windowed_rates(t: Array) -> NDArray[np.float64]:
-    """Median rate, Hz, in each window of RATE_WINDOW_S with ten samples or more."""
+    """Median rate, Hz, in each window of RATE_WINDOW_S with RATE_WINDOW_SAMPLES or more."""
     window = np.floor((t[1:] - t[0]) / RATE_WINDOW_S).astype(np.int64)
     step = np.diff(t)
     start = run_starts(window)
-    pieces = [piece for piece in np.split(step, start[1:]) if len(piece) >= TEN_SAMPLES]
+    pieces = [piece for piece in np.split(step, start[1:]) if len(piece) >= RATE_WINDOW_SAMPLES]
     return np.array([1.0 / np.median(piece) for piece in pieces])

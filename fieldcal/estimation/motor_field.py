@@ -18,33 +18,33 @@ from fieldcal.estimation.statistics import independent_samples, least_squares_co
 from fieldcal.geometry.rotation import Array
 from fieldcal.reason_codes import ReasonCode
 
-TOLD = 0.02
-"""Share of the local field, about 1° of heading, that the current's field may reach before it is told."""
+REPORTED_SHARE = 0.02
+"""Share of the local field, about 1° of heading, that the current's field may reach before it is reported."""
 
-FATAL = 0.10
+FATAL_SHARE = 0.10
 """Share beyond which no constant hard iron describes the magnetometer: about 6° of heading."""
 
-SIGNIFICANT = 1e-4
+SIGNIFICANT_P = 1e-4
 """Probability, without any influence of the current, of a slope as large as the one found."""
 
-FEWEST = 100
-LEVELS = (1.0, 99.0)
+FEWEST_SAMPLES = 100
+SPAN_PERCENTILES = (1.0, 99.0)
 """Percentiles between which the current is said to range: a spike is no range."""
 
-CONSTANT = 9
+ELLIPSOID_PARAMETERS = 9
 """Parameters of the constant ellipsoid: symmetric matrix and offset."""
 
-STEPS = 50
+MAX_ITERATIONS = 50
 
-LEAST_SEEN = 1e-3
+SMALLEST_SINGULAR_VALUE = 1e-3
 """Relative singular value of the regression below which a combination of parameters is left at 0: the flight did not
 show it."""
 
-CONVERGED, FARTHEST = 1e-6, 10.0
+CONVERGED_STEP, LARGEST_PARAMETER = 1e-6, 10.0
 """Last step and largest parameter, in local fields, of a solution."""
 
-KNOWN_SD, SURE_SD = 3.0, 2.0
-"""A component counts from so many sd on; a share refuses when it is so many sd beyond `FATAL`."""
+COMPONENT_SD, FATAL_SD = 3.0, 2.0
+"""A component counts from so many sd on; a share refuses when it is so many sd beyond `FATAL_SHARE`."""
 
 
 @dataclass(frozen=True)
@@ -92,28 +92,30 @@ def motor_field(field: ArrayLike, drive: ArrayLike, strength: float) -> MotorFie
         fit that does not converge.
     """
     h, u = np.asarray(field, dtype=float) / strength, np.asarray(drive, dtype=float)
-    if len(h) < FEWEST or not np.isfinite(h).all():
+    if len(h) < FEWEST_SAMPLES or not np.isfinite(h).all():
         return None
-    low, high = np.percentile(u, LEVELS)
+    low, high = np.percentile(u, SPAN_PERCENTILES)
     span = float(high - low)
     if span <= 0.0:
         return None
     u = (u - u.mean()) / span
-    theta = np.zeros(CONSTANT + 3)
-    for _ in range(STEPS):
+    theta = np.zeros(ELLIPSOID_PARAMETERS + 3)
+    for _ in range(MAX_ITERATIONS):
         residual, jacobian = _residual(h, u, theta)
-        step = np.linalg.lstsq(jacobian, residual, rcond=LEAST_SEEN)[0]
+        step = np.linalg.lstsq(jacobian, residual, rcond=SMALLEST_SINGULAR_VALUE)[0]
         theta = theta - step
-        if np.abs(step).max() < CONVERGED or not np.abs(theta).max() < FARTHEST:
+        if np.abs(step).max() < CONVERGED_STEP or not np.abs(theta).max() < LARGEST_PARAMETER:
             break
-    if not (np.abs(step).max() < CONVERGED and np.abs(theta).max() < FARTHEST):
+    if not (np.abs(step).max() < CONVERGED_STEP and np.abs(theta).max() < LARGEST_PARAMETER):
         return None
     residual, jacobian = _residual(h, u, theta)
-    covariance = least_squares_covariance(jacobian[:, None, :], residual[:, None])[1][CONSTANT:, CONSTANT:]
-    k, independent = theta[CONSTANT:], independent_samples(residual)
+    covariance = least_squares_covariance(jacobian[:, None, :], residual[:, None])[1][
+        ELLIPSOID_PARAMETERS:, ELLIPSOID_PARAMETERS:
+    ]
+    k, independent = theta[ELLIPSOID_PARAMETERS:], independent_samples(residual)
     variance, axes = np.linalg.eigh(covariance)
     sd = np.sqrt(np.maximum(variance, 0.0))
-    part = np.where(np.abs(k @ axes) > KNOWN_SD * sd, k @ axes, 0.0)
+    part = np.where(np.abs(k @ axes) > COMPONENT_SD * sd, k @ axes, 0.0)
     share = float(np.linalg.norm(part))
     wald = float(k @ np.linalg.pinv(covariance, hermitian=True) @ k) / 3.0
     return MotorField(
@@ -141,19 +143,19 @@ def _residual(h: Array, u: Array, theta: Array) -> tuple[Array, Array]:
 
 def _correlation(residual: Array, jacobian: Array, k: Array) -> float:
     """Multiple correlation with the drive's three columns once the constant ellipsoid is out of everything."""
-    y = residual - jacobian[:, CONSTANT:] @ k  # what the residual would be without k
-    constant = jacobian[:, :CONSTANT]
+    y = residual - jacobian[:, ELLIPSOID_PARAMETERS:] @ k  # what the residual would be without k
+    constant = jacobian[:, :ELLIPSOID_PARAMETERS]
     left = y - constant @ np.linalg.lstsq(constant, y, rcond=None)[0]
     total = float(left @ left)
     return float(np.sqrt(max(0.0, 1.0 - float(residual @ residual) / total))) if total > 0.0 else 0.0
 
 
 def motor_fault(found: MotorField, drive: str, drive_unit: str, field_unit: str) -> Fault | None:
-    """The fault that a `MotorField` is: None unless it is significant and beyond the share that is told; fatal where it
-    is surely beyond `FATAL`. Units are words for the sentence."""
-    if found.p_value > SIGNIFICANT or found.share <= TOLD:
+    """The fault that a `MotorField` is: None unless it is significant and beyond the share that is reported; fatal
+    where it is surely beyond `FATAL_SHARE`. Units are words for the sentence."""
+    if found.p_value > SIGNIFICANT_P or found.share <= REPORTED_SHARE:
         return None
-    fatal = found.share - SURE_SD * found.share_sd > FATAL
+    fatal = found.share - FATAL_SD * found.share_sd > FATAL_SHARE
     slope = ", ".join(f"{v:.3g}" for v in found.slope)
     slope_unit = ("local fields" if field_unit == "norm" else field_unit) + f" per {drive_unit or f'full {drive}'}"
     sentence = (
@@ -164,4 +166,12 @@ def motor_fault(found: MotorField, drive: str, drive_unit: str, field_unit: str)
         + ("No constant calibration describes it. " if fatal else "")
         + "Move the magnetometer away from the power wires, or twist them."
     )
-    return Fault("magnetometer", "", ReasonCode.MOTOR_FIELD, found.share, FATAL if fatal else TOLD, fatal, sentence)
+    return Fault(
+        "magnetometer",
+        "",
+        ReasonCode.MOTOR_FIELD,
+        found.share,
+        FATAL_SHARE if fatal else REPORTED_SHARE,
+        fatal,
+        sentence,
+    )

@@ -12,7 +12,7 @@ from fieldcal.geometry.rotation import Array
 MAD_TO_SIGMA = 1.4826
 HUBER = 1.345
 # Blocks taken for independent: at least so long, which is longer than a hand's motion remembers, and so few that their
-# spread can still be told.
+# spread can still be estimated.
 BLOCK_S, BLOCKS, FEWEST_BLOCKS = 2.0, 20, 6
 
 

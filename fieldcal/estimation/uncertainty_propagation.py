@@ -1,4 +1,4 @@
-"""What the magnetometer's and accelerometer's own uncertainty does to attitude and on to the gyroscope (first order).
+"""Propagation of the magnetometer's and accelerometer's uncertainty into the attitude and the gyroscope (first order).
 
 The method is serial: an error of the first triads turns the attitudes that the gyroscope is fitted to, and moves
 with the motion, so the gyroscope's residuals cannot show it. Here their covariance is carried through Wahba's

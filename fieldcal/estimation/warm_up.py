@@ -153,7 +153,7 @@ def fit_resting_accelerometer(
 ) -> WarmUp:
     """Slope of the accelerometer's zero on temperature from the longest stretch in which nothing moved.
 
-    What it cannot see: the scale's own slope, which moves the reading as far as gravity is along the axis (the usual
+    What it cannot see: the slope of the scale, which moves the reading as far as gravity is along the axis (the usual
     size of it is in the sd, so an axis along gravity says little), and the IMU settling: 0.01° of tilt is 2 mm/s².
 
     Parameters

@@ -44,7 +44,7 @@ def check_motor_field(tables: Tables, s: VectorsSettings) -> tuple[dict[str, Jso
     readings = tables["readings"].filter(pl.Series(in_used_segments(tables["readings"], tables["segments"])))
     values = matrix(readings, triad("magnetometer"))
     whole = np.isfinite(values).all(axis=1)
-    if np.count_nonzero(whole) < motor_field.FEWEST:
+    if np.count_nonzero(whole) < motor_field.FEWEST_SAMPLES:
         return {}, []
     known = _approximate(tables, s, values[whole])
     if known is None:

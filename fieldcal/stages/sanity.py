@@ -30,11 +30,11 @@ def check_sensors(tables: Tables, s: SanitySettings) -> StageResult:
         if table not in tables:
             continue
         readings = matrix(tables[table], triad(sensor))
-        known = np.isfinite(readings).all(axis=1)
-        if known.sum() < faults.TEN_SAMPLES:
+        valid = np.isfinite(readings).all(axis=1)
+        if valid.sum() < faults.FEWEST_SAMPLES:
             continue
         stamps = tables[table]["t_ns"]
-        found += _faults_of(sensor, seconds(stamps, stamps[0])[known], readings[known], s)
+        found += _faults_of(sensor, seconds(stamps, stamps[0])[valid], readings[valid], s)
     worst = next((f for f in sorted(found, key=lambda f: not f.fatal)), None)
     return StageResult(
         {"faults": fault_rows(found)},

@@ -11,6 +11,7 @@ import polars as pl
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation import ellipsoid, motion_selection
 from fieldcal.estimation.ellipsoid import TriadFit
+from fieldcal.estimation.ellipsoid_refusals import require_determined
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import VECTOR_SENSORS, EllipsoidFit, Json, Method, Sensor, Status, Triple
@@ -119,7 +120,7 @@ def _judged(
     code = reason = None
     measured = {**fit.measured(), **extra}
     try:
-        ellipsoid.require_determined(
+        require_determined(
             fit,
             max_condition=s.ellipsoid_max_condition,
             max_scale_sd=s.ellipsoid_max_scale_sd,

@@ -10,7 +10,8 @@ from numerics_support import autoregressive, constants, directions, logged, rms
 from scipy.optimize import least_squares
 
 from fieldcal.errors import EstimationError, UnusableFlight
-from fieldcal.estimation.ellipsoid import METHODS, TriadFit, direction_condition, fit_ellipsoid, require_determined
+from fieldcal.estimation.ellipsoid import METHODS, TriadFit, direction_condition, fit_ellipsoid
+from fieldcal.estimation.ellipsoid_refusals import require_determined
 from fieldcal.geometry.rotation import body_from_inertial, from_euler
 from fieldcal.simulation.experiment import NOISE_VARIANCE, Experiment, simulate
 

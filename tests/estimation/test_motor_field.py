@@ -17,7 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from fieldcal.config.configuration import CsvMap, McapMap
 from fieldcal.errors import UnreadableLog
-from fieldcal.estimation.motor_field import FATAL, SIGNIFICANT, TOLD, MotorField, motor_fault, motor_field
+from fieldcal.estimation.motor_field import (
+    FATAL_SHARE,
+    REPORTED_SHARE,
+    SIGNIFICANT_P,
+    MotorField,
+    motor_fault,
+    motor_field,
+)
 from fieldcal.flight.calibrate import calibrate_log
 from fieldcal.logs import read_log
 from fieldcal.logs.encodings.ros2_definitions import full_text
@@ -115,7 +122,7 @@ def test_a_current_is_found_in_coloured_noise() -> None:
         noise = NOISE * FIELD_UT * autoregressive(np.random.default_rng([4, seed]), h.shape, 0.5)
         slope = 0.15 * FIELD_UT * SLOPE_UT_PER_A / np.linalg.norm(SLOPE_UT_PER_A)
         result = found(h + np.outer(current / np.ptp(np.percentile(current, [1.0, 99.0])), slope) + noise, current)
-        assert result.p_value < SIGNIFICANT
+        assert result.p_value < SIGNIFICANT_P
         assert result.share == pytest.approx(0.15, abs=0.05)
 
 
@@ -131,18 +138,18 @@ def result_of(share: float, p_value: float) -> MotorField:
 
 
 def test_limits_and_sentence() -> None:
-    assert motor_fault(result_of(0.5, 2 * SIGNIFICANT), "current", "A", "uT") is None
-    assert motor_fault(result_of(TOLD, 0.0), "current", "A", "uT") is None
-    unsure = motor_fault(result_of(FATAL + 0.001, 0.0), "current", "A", "uT")  # its sd is 0.001
+    assert motor_fault(result_of(0.5, 2 * SIGNIFICANT_P), "current", "A", "uT") is None
+    assert motor_fault(result_of(REPORTED_SHARE, 0.0), "current", "A", "uT") is None
+    unsure = motor_fault(result_of(FATAL_SHARE + 0.001, 0.0), "current", "A", "uT")  # its sd is 0.001
     assert unsure is not None
     assert not unsure.fatal
-    told, fatal = (motor_fault(result_of(share, 0.0), "current", "A", "uT") for share in (0.05, FATAL + 0.01))
+    told, fatal = (motor_fault(result_of(share, 0.0), "current", "A", "uT") for share in (0.05, FATAL_SHARE + 0.01))
     assert told is not None
-    assert (told.code, told.value, told.limit, told.fatal) == ("motor_field", 0.05, TOLD, False)
+    assert (told.code, told.value, told.limit, told.fatal) == ("motor_field", 0.05, REPORTED_SHARE, False)
     assert "5.0 % of the local field" in told.sentence
     assert "(0.09, -0.05, 0.12) uT per A" in told.sentence
     assert fatal is not None
-    assert (fatal.value, fatal.limit, fatal.fatal) == (FATAL + 0.01, FATAL, True)
+    assert (fatal.value, fatal.limit, fatal.fatal) == (FATAL_SHARE + 0.01, FATAL_SHARE, True)
     throttle = motor_fault(result_of(0.05, 0.0), "throttle", "", "norm")
     assert throttle is not None
     assert "local fields per full throttle" in throttle.sentence
@@ -190,7 +197,7 @@ def test_a_log_without_the_field_is_clean_and_one_without_the_current_as_ever(tm
     flight, measured, rows = calibrated(flown(tmp_path / "a", 0.0, "current_a", "throttle"))
     assert (flight["verdict"], codes(flight), rows) == ("ok", [], {("ok", None)})
     assert measured["motor_field"]["drive"] == "current_a"
-    assert measured["motor_field"]["share"] < TOLD
+    assert measured["motor_field"]["share"] < REPORTED_SHARE
     flight, measured, rows = calibrated(flown(tmp_path / "b", 0.05))
     assert (flight["verdict"], codes(flight), measured, rows) == ("ok", [], {}, {("ok", None)})
 
@@ -229,7 +236,7 @@ def test_a_field_of_thirteen_per_cent_refuses_the_magnetometer_with_the_number(t
     assert rows == {("refused", "motor_field")}
     assert "motor_field" in codes(flight)
     fault = measured["faults"][0]
-    assert (fault["fatal"], fault["limit"]) == (True, FATAL)
+    assert (fault["fatal"], fault["limit"]) == (True, FATAL_SHARE)
     assert fault["value"] == pytest.approx(0.13, abs=0.015)
     assert "No constant calibration describes it" in fault["sentence"]
 

@@ -1,9 +1,8 @@
 """The VPS clock to a tenth of a millisecond: the magnetometer turns with the vehicle and has less noise than rates.
 
-With the VPS's attitude the field in sensor axes is known but for constants: every logged component is linear in the
-nine elements of A(q_vps), whatever the triad's calibration, the mounting and the local field. So nothing estimated
-before can move the lag, neither an attitude that translation has spoiled nor a wrong constant.
-"""
+With the VPS's attitude the field in sensor axes is determined except for constants: every logged component is linear in
+the nine elements of A(q_vps), whatever the triad's calibration, the mounting and the local field. So nothing estimated
+before can move the lag, neither an attitude that translation has spoiled nor a wrong constant."""
 
 from __future__ import annotations
 
@@ -50,14 +49,14 @@ def refine_by_field(
     t, logged : (n,), (n, 3) arrays
         Stamps, s, IMU clock, and readings of the magnetometer, any unit, not filtered; NaN where there is none.
     t_vps, q_vps : (m,), (m, 4) arrays
-        VPS stamps on its own clock, s, and attitudes, outliers removed (`clock_sync.by_rates.mask_outliers`).
+        VPS stamps on the VPS clock, s, and attitudes, outliers removed (`clock_sync.by_rates.mask_outliers`).
     fit : SyncFit
         From the rates: where to begin.
 
     Returns
     -------
-    The combined fit, and the magnetometer's own; None with too few readings. Where the two contradict each other
-    (sensors with filters of their own: 11 ms were seen) the gyroscope's fit is returned as it was.
+    The combined fit, and the magnetometer's alone; None with too few readings. Where the two contradict each other
+    (sensors with different filters: 11 ms were seen) the gyroscope's fit is returned as it was.
 
     Notes
     -----

@@ -34,7 +34,7 @@ from fieldcal.reason_codes import ReasonCode
 
 FINE_CUTOFF_HZ = 8.0
 REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock
-# Chance peaks of unrelated motions reach 0.9 in the coarse correlation; the vector fit tells them.
+# Chance peaks of unrelated motions reach 0.9 in the coarse correlation; the vector fit tells them apart.
 MIN_EXPLAINED, MAX_SKEW_PPM, MAX_LAG_SD_S = 0.6, 2000.0, 0.01
 
 
@@ -220,7 +220,7 @@ def synchronise(
     t_imu, rate_imu : (n,), (n, 3) arrays
         IMU stamps, s, and gyroscope readings, any axes; calibrated or, if need be, logged units less their median.
     t_vps, q_vps : (m,), (m, 4) arrays
-        VPS stamps, s, own clock, and attitudes, outliers already removed (`mask_outliers`).
+        VPS stamps, s, on the VPS clock, and attitudes, outliers already removed (`mask_outliers`).
 
     Raises
     ------
@@ -298,7 +298,7 @@ def _refine(
         x = np.column_stack([w, np.ones(len(w))])
         (affine, residual, xw), weight = _regressed(x, imu.rate[inside])
         matrix = affine[:3].T
-        # Sensitivity of the prediction to lag (minus) and skew; the affine map's own columns are projected out.
+        # Sensitivity of the prediction to lag (minus) and skew; the columns of the affine map are projected out.
         moved = w_dot @ matrix.T
         columns = np.stack([-moved, moved * (t[inside] - middle)[:, None]], axis=2)
         flat = columns.reshape(len(w), 6)

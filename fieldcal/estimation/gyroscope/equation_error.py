@@ -56,8 +56,8 @@ def fit_equation_error(
         Gyroscope as logged, ω_d, body axes, smoothed with the *same* weights as the attitude: noise in this regressor
         pulls the scales towards zero (−3.5 % raw, −0.8 % smoothed at the paper's noise).
     noise_variance : (3,) array, optional
-        Variance of the noise that is left in `rate_logged`, its unit². It is taken off the regressor's own (errors in
-        variables), which removes that pull; `equations="scalar"`, the paper's, keeps it.
+        Variance of the noise that is left in `rate_logged`, its unit². It is subtracted from the regressor's variance
+        (errors in variables), which removes that pull; `equations="scalar"`, the paper's, keeps it.
     equations : {"all", "scalar"}
         "scalar" is the paper's δ̇ alone (Eq. 12–15, with the ½ the paper's X lacks). "all" uses the four: ω̂ = 2Ξᵀq̇
         on (ω_d, 1), where the axes decouple.

@@ -1,8 +1,8 @@
 """Gyroscope scale and bias by output error: integrate Eq. 10 with the real stamps and match the attitude.
 
-The paper integrates once from a known start. Over tens of seconds that ignores what gyroscope noise does to an
+The paper integrates once from a given attitude. Over tens of seconds that ignores what gyroscope noise does to an
 integral (0.135 rad/s is a 3.6° random walk in 40 s), so by default the record is cut into stretches, each with an
-initial attitude of its own that is eliminated (multiple shooting).
+initial attitude that is eliminated (multiple shooting).
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ def random_walk(t: Array, residual: Array, stretch: np.ndarray, weight: Array) -
     """Random walk in the attitude error, rad²/s a component, and the share of the residual's variance that it makes.
 
     From means over twelfths of a stretch: how much further apart they are half a stretch away than next to each other.
-    What is stationary in the residual (the attitude's own error) averages out in the means and is as far apart at both
-    distances."""
+    What is stationary in the residual (the error of the measured attitude) averages out in the means and is as far
+    apart at both distances."""
     bounds = run_bounds(stretch)
     lengths = [stop - start for start, stop in bounds]
     typical, apart = float(np.median(lengths)), BLOCKS // 2
@@ -120,7 +120,7 @@ def walk_information(weighted: Array, dt: Array, first: np.ndarray, walk: float)
 
 
 def suitable_stretch_s(rate_noise: float, interval_s: float, attitude_sd: float) -> float:
-    """How long one may integrate before gyroscope noise outgrows the attitude's own error, s, within 5 to 200 s.
+    """How long one may integrate before gyroscope noise outgrows the attitude's error, s, within 5 to 200 s.
 
     White rate noise σ (rad/s a sample, every Δt) walks: over a stretch L the integral's scatter about its mean is
     σ²Δt L/6. Equal to the attitude variance at L = 6 σ_att²/(σ²Δt)."""
@@ -182,7 +182,7 @@ def fit_output_error(
     Notes
     -----
     The covariance is the coloured-residual form. It cannot see errors of the attitude that move with the motion
-    itself: see `attitude_propagation` for what the magnetometer's and accelerometer's own uncertainty adds.
+    itself: see `uncertainty_propagation` for what the magnetometer's and accelerometer's uncertainty adds.
     """
     t, q, w_d = (np.asarray(v, dtype=float) for v in (t, q, rate_logged))
     n = len(t)

@@ -24,7 +24,7 @@ def smoothed_noise_variance(
 
     White noise of density S, one-sided, leaves ½ S f_s Σh² behind weights h. S is read off one to two octaves above the
     cut-off, where the motion has ended: the median over frequency of the mean periodogram of 1 s blocks (Hann), so
-    that a motor's line does not count. 0, no noise known, where smoothing is off or the sampling leaves no such band.
+    that a motor's line does not count. 0 where smoothing is off or the sampling leaves no such band.
 
     Parameters
     ----------
