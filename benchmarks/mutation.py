@@ -22,7 +22,6 @@ from __future__ import annotations
 import argparse
 import ast
 import contextlib
-import importlib.abc
 import importlib.machinery
 import importlib.util
 import itertools
@@ -48,9 +47,9 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGE = REPOSITORY / "fieldcal"
 TESTS_FOLDER = REPOSITORY / "tests"
+Place = ast.expr | ast.stmt
 MEMORY_BYTES = 4 << 30
 LEAST_TIMEOUT_S = 20
-FLOAT_FACTOR = 1.1
 ALIVE_SHARE = 1 / 20
 
 TESTS: dict[str, Sequence[str]] = {
@@ -157,7 +156,7 @@ class Score:
     alive: list[Change] = field(default_factory=list)
 
 
-def places(tree: ast.Module) -> Iterator[tuple[ast.AST, bool, str, Callable[[], None]]]:
+def places(tree: ast.Module) -> Iterator[tuple[Place, bool, str, Callable[[], None]]]:
     """Every node that is changed, whether it runs at import, the change in words, and a function that makes it."""
     skipped: set[int] = set()
     inside: set[int] = set()
@@ -180,6 +179,7 @@ def places(tree: ast.Module) -> Iterator[tuple[ast.AST, bool, str, Callable[[], 
         union_of_types = at_import and isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitOr)
         if id(node) not in skipped and not union_of_types:
             for what, make in _changes(node):
+                assert isinstance(node, Place)
                 yield node, at_import, what, make
 
 
@@ -205,11 +205,12 @@ def _changes(node: ast.AST) -> Iterator[tuple[str, Callable[[], None]]]:
 
 
 def _other(value: float) -> float:
+    """A tenth more, or one more where that is less than one."""
     if isinstance(value, bool):
         return not value
     if isinstance(value, int):
-        return value + 1
-    return value * FLOAT_FACTOR if value else 1.0
+        return value + max(1, value // 10)
+    return 1.1 * value if value else 1.0
 
 
 def source_of(module: str) -> Path:
@@ -250,7 +251,7 @@ def tests_of(module: str) -> list[Path]:
     return sorted({path for pattern in TESTS[room] for path in TESTS_FOLDER.glob(pattern)})
 
 
-class _Loader(importlib.machinery.SourceFileLoader, importlib.abc.MetaPathFinder):
+class _Loader(importlib.machinery.SourceFileLoader):
     """Gives one module the code of a changed syntax tree."""
 
     def __init__(self, change: Change) -> None:

@@ -1,0 +1,215 @@
+"""`apply` on a small log whose readings and temperatures are written here, with constants given by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from logs_support import EPOCH_NS, messages_by_mcap_ros2
+
+from fieldcal.errors import FieldcalError
+from fieldcal.exports import apply
+from fieldcal.exports.calibration import Constants, Triad
+from fieldcal.logs.mcap.write import (
+    MessageChannel,
+    imu_channel,
+    magnetic_field_channel,
+    temperature_channel,
+    write_mcap,
+)
+from fieldcal.names import Sensor
+from fieldcal.stages.tables import matrix, triad
+
+SAMPLES = 400
+T_NS = EPOCH_NS + 5_000_000 * np.arange(SAMPLES)
+RNG = np.random.default_rng(11)
+RATE, FORCE, FIELD = RNG.normal(size=(3, SAMPLES, 3))
+WARM_T_NS = EPOCH_NS - 500_000_000 + 100_000_000 * np.arange(31)
+UNITS = {Sensor.GYROSCOPE: "rad/s", Sensor.ACCELEROMETER: "m/s^2", Sensor.MAGNETOMETER: "T"}
+EQUAL = 1e-9
+
+
+def degc(t_ns: np.ndarray) -> np.ndarray:
+    """From 20 °C half a second before the first reading, 4 °C a second."""
+    return 20.0 + 4.0 * ((t_ns - EPOCH_NS) * 1e-9 + 0.5)
+
+
+def constant(sensor: Sensor, **changes: Any) -> Triad:
+    plain = Triad(
+        scale=np.diag([1.1, 0.9, 1.2]),
+        zero=np.array([0.1, -0.2, 0.3]),
+        scale_per_degc=np.zeros((3, 3)),
+        zero_per_degc=np.array([0.01, -0.02, 0.03]),
+        scale_sd=np.ones(3),
+        zero_sd=np.ones(3),
+        unit=UNITS[sensor],
+        logged_unit=UNITS[sensor],
+        temperature_degc=25.0,
+        flown_degc=(0.0, 50.0),
+        why=(),
+    )
+    return replace(plain, **changes)
+
+
+def by_hand(t: Triad, logged: np.ndarray, temperature: np.ndarray | float) -> np.ndarray:
+    """Eq. 5 with independent axes, sample by sample."""
+    warmer = np.broadcast_to(np.asarray(temperature) - 25.0, len(logged))
+    return np.diagonal(t.scale) * (logged - t.zero - warmer[:, None] * t.zero_per_degc)
+
+
+def log_of(folder: Path, *channels: MessageChannel) -> Path:
+    path = folder / "archive" / "v" / "s" / "log.mcap"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_mcap(path, channels)
+    return path
+
+
+IMU = imu_channel(T_NS, None, RATE, FORCE)
+MAG = magnetic_field_channel(T_NS[::2], None, FIELD[::2])
+WARM = temperature_channel(WARM_T_NS, None, degc(WARM_T_NS))
+
+
+@pytest.fixture
+def flown_with(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Lets `apply` find these constants in the warehouse."""
+
+    def give(*sensors: Sensor, **changes: Any) -> Constants:
+        constants = Constants("v", "i", {s: constant(s, **changes) for s in sensors or Sensor}, "2026")
+        monkeypatch.setattr(apply, "constants_of", lambda root, vehicle_id, at: constants)
+        return constants
+
+    return give
+
+
+def calibrated(log: Path, at: float | None = None, config: Path | None = None) -> apply.Calibrated:
+    return apply.apply_constants(log, log.parent, config, None, at)
+
+
+def test_every_sample_at_its_own_temperature(flown_with: Any, tmp_path: Path) -> None:
+    """Temperatures lie ten times as far apart as readings and do not begin with them: a straight line between them."""
+    constants = flown_with()
+    found = calibrated(log_of(tmp_path, IMU, MAG, WARM)).readings
+    for sensor, t_ns, logged in (
+        (Sensor.GYROSCOPE, T_NS, RATE),
+        (Sensor.ACCELEROMETER, T_NS, FORCE),
+        (Sensor.MAGNETOMETER, T_NS[::2], FIELD[::2]),
+    ):
+        np.testing.assert_array_equal(found[sensor][0], t_ns)
+        wanted = by_hand(constants.triads[sensor], logged, degc(t_ns))
+        np.testing.assert_allclose(found[sensor][1], wanted, rtol=0, atol=EQUAL)
+
+
+def test_outside_the_temperatures_the_nearest_one_counts(flown_with: Any, tmp_path: Path) -> None:
+    constants = flown_with()
+    late = WARM_T_NS + 1_000_000_000
+    warm = temperature_channel(late, None, degc(late))
+    found = calibrated(log_of(tmp_path, IMU, warm)).readings[Sensor.GYROSCOPE][1]
+    wanted = by_hand(constants.triads[Sensor.GYROSCOPE], RATE, degc(np.maximum(T_NS, late[0])))
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=EQUAL)
+
+
+@pytest.mark.parametrize(("channels", "at"), [((IMU,), None), ((IMU, WARM), 25.0)])
+def test_constants_as_they_are_without_temperatures_or_at_one_that_is_given(
+    flown_with: Any, tmp_path: Path, channels: tuple[MessageChannel, ...], at: float | None
+) -> None:
+    constants = flown_with()
+    found = calibrated(log_of(tmp_path, *channels), at)
+    wanted = by_hand(constants.triads[Sensor.GYROSCOPE], RATE, 25.0)
+    np.testing.assert_allclose(found.readings[Sensor.GYROSCOPE][1], wanted, rtol=0, atol=EQUAL)
+    assert found.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("flown", "told"),
+    [
+        (None, None),
+        ((20.0, 32.0), None),
+        ((20.1, 40.0), "20.0 to 32.0 °C goes beyond the 20.1 to 40.0 °C flown"),
+        ((10.0, 31.9), "20.0 to 32.0 °C goes beyond the 10.0 to 31.9 °C flown"),
+        ((22.0, 28.0), "20.0 to 32.0 °C goes beyond the 22.0 to 28.0 °C flown"),
+    ],
+)
+def test_colder_or_warmer_than_flown_is_told(
+    flown_with: Any, tmp_path: Path, flown: tuple[float, float] | None, told: str | None
+) -> None:
+    """The log's temperatures are 20 to 32 °C."""
+    flown_with(flown_degc=flown)
+    warnings = calibrated(log_of(tmp_path, IMU, WARM)).warnings
+    assert [w.split(": ")[1].rstrip(".") for w in warnings] == ([told, told] if told else [])
+    assert calibrated(log_of(tmp_path, IMU, WARM), 90.0).warnings == ()
+
+
+def test_sensors_without_constants_or_readings_are_left_out(flown_with: Any, tmp_path: Path) -> None:
+    flown_with(Sensor.ACCELEROMETER, Sensor.MAGNETOMETER)
+    found = calibrated(log_of(tmp_path, IMU))
+    assert list(found.readings) == [Sensor.ACCELEROMETER]
+    assert found.warnings == ("gyroscope: no constants, so it is left out.",)
+    flown_with(Sensor.MAGNETOMETER)
+    with pytest.raises(FieldcalError, match="no sensor of this log has constants") as caught:
+        calibrated(log_of(tmp_path, IMU))
+    assert caught.value.reason_code == "no_calibration"
+    flown_with(logged_unit="counts")
+    with pytest.raises(FieldcalError, match="gyroscope is in rad/s, the constants are for counts") as caught:
+        calibrated(log_of(tmp_path, IMU))
+    assert caught.value.reason_code == "unit_mismatch"
+
+
+def test_the_archives_own_configuration_counts_unless_another_is_given(flown_with: Any, tmp_path: Path) -> None:
+    flown_with()
+    log = log_of(tmp_path, IMU)
+    (tmp_path / "archive" / "fieldcal.toml").write_text('[vehicles.v.units]\ngyroscope = "deg/s"\n')
+    other = tmp_path / "other.toml"
+    other.write_text('[vehicles.v.units]\ngyroscope = "rad/s"\n')
+    with pytest.raises(FieldcalError, match="gyroscope is in deg/s"):
+        calibrated(log)
+    assert Sensor.GYROSCOPE in calibrated(log, config=other).readings
+
+
+def test_an_absent_sensor_is_null_in_parquet_and_marked_in_ros(flown_with: Any, tmp_path: Path) -> None:
+    """Folders are made, and made again; REP-103 has x forward, y left, z up, the log says it is so already."""
+    for sensor, other in (
+        (Sensor.GYROSCOPE, Sensor.ACCELEROMETER),
+        (Sensor.ACCELEROMETER, Sensor.GYROSCOPE),
+    ):
+        constants = flown_with(sensor)
+        found = calibrated(log_of(tmp_path, IMU))
+        for _ in range(2):
+            (path,) = apply.write_parquet(found, tmp_path / "deep" / "er" / sensor)
+        frame = pl.read_parquet(path)
+        logged = {Sensor.GYROSCOPE: RATE, Sensor.ACCELEROMETER: FORCE}[sensor]
+        wanted = by_hand(constants.triads[sensor], logged, 25.0)
+        np.testing.assert_allclose(matrix(frame, triad(sensor)), wanted, rtol=0, atol=EQUAL)
+        assert all(frame[f"{other}_{axis}"].null_count() == SAMPLES for axis in "xyz")
+        assert apply.write_ros(found, tmp_path / "far" / "off" / f"{sensor}.mcap") == ()
+        messages = [m for _, m in messages_by_mcap_ros2(tmp_path / "far" / "off" / f"{sensor}.mcap", "/imu/data")]
+        assert len(messages) == SAMPLES
+        here, there = ("angular_velocity", "linear_acceleration")[:: 1 if sensor == Sensor.GYROSCOPE else -1]
+        for row in (0, SAMPLES - 1):
+            vector = getattr(messages[row], here)
+            np.testing.assert_allclose([vector.x, vector.y, vector.z], wanted[row], rtol=0, atol=EQUAL)
+            assert getattr(messages[row], f"{here}_covariance")[0] == 0.0
+            assert getattr(messages[row], f"{there}_covariance")[0] == -1.0
+
+
+@pytest.mark.parametrize(
+    ("sensors", "channels", "topics"),
+    [
+        ((), (IMU,), {"/imu/data"}),
+        ((), (IMU, MAG, WARM), {"/imu/data", "/imu/mag", "/imu/temperature"}),
+        ((Sensor.MAGNETOMETER,), (IMU, MAG), {"/imu/mag"}),
+    ],
+)
+def test_only_what_the_log_holds_is_written(
+    flown_with: Any, tmp_path: Path, sensors: tuple[Sensor, ...], channels: tuple[MessageChannel, ...], topics: set[str]
+) -> None:
+    flown_with(*sensors)
+    found = calibrated(log_of(tmp_path, *channels))
+    path = tmp_path / "out.mcap"
+    apply.write_ros(found, path)
+    rows = {"/imu/data": SAMPLES, "/imu/mag": SAMPLES // 2, "/imu/temperature": len(WARM_T_NS)}
+    for topic, count in rows.items():
+        assert len(list(messages_by_mcap_ros2(path, topic))) == (count if topic in topics else 0)

@@ -1,0 +1,93 @@
+"""Exports as texts: read by the languages' own readers, unknown things are said to be unknown."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from fieldcal.exports import FORMATS
+from fieldcal.exports.calibration import Constants, Triad
+from fieldcal.names import Sensor
+
+
+def triad(**changes: object) -> Triad:
+    """A plain triad; the zero's bends are left to their defaults."""
+    plain = Triad(
+        scale=np.diag([0.25, 1e-5, 1.5e-5]),
+        zero=np.array([1e-5, 2e22, -3.5]),
+        scale_per_degc=np.zeros((3, 3)),
+        zero_per_degc=np.zeros(3),
+        scale_sd=np.full(3, np.nan),
+        zero_sd=np.ones(3),
+        unit="rad/s",
+        logged_unit="counts",
+        temperature_degc=20.0,
+        flown_degc=None,
+        why=(),
+    )
+    return replace(plain, **changes)
+
+
+def constants(as_of: str = "", vehicle_id: str = "v", **changes: object) -> Constants:
+    return Constants(vehicle_id, "i", {Sensor.GYROSCOPE: triad(**changes)}, as_of)
+
+
+def test_numbers_of_yaml_are_numbers() -> None:
+    """YAML 1.1 takes 1e-05 for text and 1.0e-05 for a number."""
+    written = yaml.safe_load(FORMATS["ros"](constants()).text)["/**"]["ros__parameters"]["fieldcal"]["gyroscope"]
+    assert written["zero"] == [1e-5, 2e22, -3.5]
+    assert written["scale"] == np.diag([0.25, 1e-5, 1.5e-5]).ravel().tolist()
+    assert all(np.isnan(v) for v in written["scale_sd"])
+
+
+def test_kalibr_gets_matrices_of_its_sizes() -> None:
+    """imu0 of kalibr's calibration-yaml: T_i_b is 4 × 4, A and C_gyro_i are 3 × 3."""
+    imu = yaml.safe_load(FORMATS["kalibr"](constants()).text)["imu0"]
+    assert imu["T_i_b"] == np.eye(4).tolist()
+    assert imu["gyroscopes"]["A"] == np.zeros((3, 3)).tolist()
+    assert imu["gyroscopes"]["C_gyro_i"] == np.eye(3).tolist()
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({}, False),
+        ({"zero_per_degc": np.array([0.0, 1.0, 0.0])}, True),
+        ({"scale_per_degc": np.diag([0.0, 0.0, 1.0])}, True),
+    ],
+)
+def test_kalibr_is_told_of_temperature_when_there_is_some(changes: dict[str, np.ndarray], told: bool) -> None:
+    assert (
+        any("knows no temperature" in warning for warning in FORMATS["kalibr"](constants(**changes)).warnings) == told
+    )
+
+
+@pytest.mark.parametrize("as_of", ["", "2026-05-04T12:00:00+00:00"])
+def test_when_is_said_or_said_to_be_unknown(as_of: str) -> None:
+    for form in ("c", "px4", "ardupilot", "kalibr"):
+        assert f"as of {as_of or 'unknown'}" in FORMATS[form](constants(as_of)).text, form
+    assert json.loads(FORMATS["json"](constants(as_of)).text)["as_of"] == (as_of or None)
+
+
+def test_ids_beyond_ascii() -> None:
+    """JSON holds them as they are; C source is plain ASCII."""
+    c = constants(vehicle_id="Möwe")
+    assert '"Möwe"' in FORMATS["json"](c).text
+    assert FORMATS["c"](c).text.isascii()
+
+
+def test_json_has_no_nan() -> None:
+    assert json.loads(FORMATS["json"](constants()).text)["sensors"]["gyroscope"]["scale_sd"] == [None] * 3
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        FORMATS["json"](constants(temperature_degc=np.nan))
+
+
+def test_a_zero_without_bends_is_a_line_over_temperature() -> None:
+    sloped = triad(zero_per_degc=np.array([1.0, 2.0, 3.0]), scale=np.eye(3), zero=np.zeros(3))
+    found = sloped.apply(np.zeros((2, 3)), np.array([21.0, 30.0]))
+    np.testing.assert_array_equal(found, [[-1.0, -2.0, -3.0], [-10.0, -20.0, -30.0]])
+    assert sloped.zero_per_degc2.tolist() == sloped.zero_per_degc3.tolist() == [0.0, 0.0, 0.0]
