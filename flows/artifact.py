@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from fieldcal.batch.documents import LogEntry, NightDocument
 from fieldcal.batch.outcome import verdict_counts
@@ -40,7 +39,7 @@ def keep_artifact(result: NightDocument, root: Path) -> None:
         say(f"Prefect keeps no table of this night ({type(error).__name__}); the warehouse has it all.")
 
 
-def _rows(log: LogEntry) -> list[dict[str, Any]]:
+def _rows(log: LogEntry) -> list[dict[str, str | None]]:
     own = [] if log["verdict"] == Verdict.OK else [{"what": log["verdict"], "why": log["reason"] or log["reason_code"]}]
     refused = [{"what": f"{r['stage']} {r['status']}", "why": r["reason"] or r["reason_code"]} for r in log["refusals"]]
     return [{"log": log["log_uri"], **row} for row in own + refused]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 from prefect import flow, serve
 from prefect.deployments.runner import RunnerDeployment
@@ -41,7 +41,7 @@ def deployments(
     archive: Path, root: Path, config: Path | None, cron: str, workers: int, timezone: str | None = None
 ) -> list[RunnerDeployment]:
     """The three deployments. Parameters name absolute paths, so that they hold wherever they run on this machine."""
-    common: dict[str, Any] = {
+    common: dict[str, str | int | None] = {
         "warehouse": str(root.absolute()),
         "config": str(config.absolute()) if config else None,
         "workers": workers,
@@ -50,7 +50,7 @@ def deployments(
         name=EVENT, expect={EVENT}, parameters={"folder": "{{ event.payload.folder }}"}, enabled=True
     )
     module = EntrypointType.MODULE_PATH
-    found: list[Any] = [
+    found = [
         nightly.to_deployment(
             DEPLOYMENT,
             schedule=Cron(cron, timezone=timezone or local_timezone()),
@@ -60,7 +60,8 @@ def deployments(
         session.to_deployment(DEPLOYMENT, parameters=common, entrypoint_type=module),
         session_landed.to_deployment(DEPLOYMENT, triggers=[landed], entrypoint_type=module),
     ]
-    return found
+    # A coroutine is what these are only where an event loop runs, which no command has.
+    return cast(list[RunnerDeployment], found)
 
 
 def host(hosted: list[RunnerDeployment], url: str, watched: Path | None, quiet_s: float) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from prefect import Flow, flow
 
@@ -27,6 +27,9 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.run_key import code_digest
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.words.talk import say
+
+PlainValue = str | list[int] | None
+"""In a `PlainJob`; that itself Prefect, which shows its server the parameters of flows, cannot describe."""
 
 
 @flow(name="nightly", persist_result=False, validate_parameters=False)
@@ -77,7 +80,9 @@ def session(
 
 
 @flow(name="batch", persist_result=False, validate_parameters=False)
-def batch(number: int, root: str, source: Source, jobs: list[dict[str, Any]], code: str, handed_over: str) -> None:
+def batch(
+    number: int, root: str, source: Source, jobs: list[dict[str, PlainValue]], code: str, handed_over: str
+) -> None:
     """A batch in a flow run of its own, in a work pool; its answer is handed over as a file of the warehouse."""
     with alive(Path(root)):
         hand_over(Path(root), handed_over, run_batch(number, root, source, cast(list[PlainJob], jobs), code))

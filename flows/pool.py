@@ -9,8 +9,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
-from uuid import uuid4
+from typing import cast
+from uuid import UUID, uuid4
 
 from fieldcal.batch.documents import Answer, Batch
 from fieldcal.errors import FieldcalError
@@ -44,7 +44,7 @@ def pool_answers(inputs: Sequence[Batch]) -> Iterator[tuple[Batch, Answer | Exce
         except ObjectNotFound as error:
             what = f"The server has no deployment {BATCH_DEPLOYMENT}: run `prefect deploy --all` (prefect.yaml)."
             raise FieldcalError(ReasonCode.NO_DEPLOYMENT, what) from error
-        waiting: dict[Any, tuple[Batch, str]] = {}
+        waiting: dict[UUID, tuple[Batch, str]] = {}
         for given in inputs:
             name = uuid4().hex
             run = client.create_flow_run_from_deployment(deployment.id, parameters={**given, "handed_over": name})

@@ -16,6 +16,8 @@ from fieldcal.batch.documents import Answer, Batch
 from fieldcal.flows.runners import Answers, answer_of
 
 LISTEN_S = 0.25
+Context = dict[str, Any]
+"""As Prefect's own `serialize_context` gives it."""
 
 
 def spawned(workers: int) -> ProcessPoolExecutor:
@@ -44,7 +46,7 @@ def process_answers(pool: ProcessPoolExecutor, inputs: Sequence[Batch]) -> Answe
         pool.shutdown(wait=False)  # they tell Prefect the rest while the night publishes
 
 
-def _context() -> dict[str, Any]:
+def _context() -> Context:
     """Prefect's context, with the name of its flow instead of the flow: a function is not sent."""
     from prefect.context import serialize_context
 
@@ -57,7 +59,7 @@ def _import() -> None:
     import_module("fieldcal.flows.nightly")
 
 
-def _batch(context: dict[str, Any], given: Batch) -> Answer:
+def _batch(context: Context, given: Batch) -> Answer:
     """One batch, in one of the processes."""
     from prefect.context import hydrated_context
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Protocol
 
 from fieldcal.batch.documents import Answer, Batch
 from fieldcal.errors import FieldcalError
@@ -13,7 +13,7 @@ from fieldcal.reason_codes import ReasonCode
 
 if TYPE_CHECKING:
     from prefect import Task
-    from prefect.task_runners import TaskRunner
+    from prefect_dask.task_runners import DaskTaskRunner
 
 RUNNERS = ("process", "dask", "pool")
 LARGEST_BATCH = 40
@@ -66,7 +66,7 @@ Answers = Iterator[tuple[Batch, Answer | Exception]]
 """Each input with what came back, in the order in which they end."""
 
 
-def dask_answers(parallel: Parallel, task: Task[Any, Answer], inputs: Sequence[Batch]) -> Answers:
+def dask_answers(parallel: Parallel, task: Task[..., Answer], inputs: Sequence[Batch]) -> Answers:
     """Run `task` on a Dask cluster: the one of the scheduler, or one of this machine.
 
     Raises
@@ -82,16 +82,21 @@ def dask_answers(parallel: Parallel, task: Task[Any, Answer], inputs: Sequence[B
             yield waiting[future], answer_of(future)
 
 
-def answer_of(future: Any) -> Answer | Exception:
+class Finished(Protocol):
+    """A future, Python's or Prefect's."""
+
+    def result(self) -> Answer: ...
+
+
+def answer_of(future: Finished) -> Answer | Exception:
     """What a finished batch came back with."""
     try:
-        answer: Answer = future.result()
+        return future.result()
     except Exception as error:
         return error
-    return answer
 
 
-def _dask(parallel: Parallel) -> TaskRunner[Any]:
+def _dask(parallel: Parallel) -> DaskTaskRunner:
     try:
         from distributed import Client
         from prefect_dask.task_runners import DaskTaskRunner

@@ -19,11 +19,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import fieldcal
 from fieldcal.errors import FieldcalError
 from fieldcal.file_locks import fcntl
+from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
 
 START_TIMEOUT_S = 180.0
@@ -75,8 +76,7 @@ def home_of(root: Path, *, serving: bool) -> Path:
 
 def serving_address(root: Path) -> str | None:
     """Address of the server that `fieldcal serve` started for this root; None when none is recorded."""
-    found = _recorded(home_of(root, serving=True))
-    return str(found["url"]) if found else None
+    return _recorded(home_of(root, serving=True))
 
 
 class Server:
@@ -107,8 +107,8 @@ class Server:
         self._using = _locked(self._home / USERS, fcntl.LOCK_SH)  # waits while a server is ending
         self._starting = _locked(self._home / "server.lock", fcntl.LOCK_EX)  # waits while another command starts one
         running = _recorded(self._home)
-        if running is not None and answers(running["url"]):
-            self._url = str(running["url"])
+        if running is not None and answers(running):
+            self._url = running
         else:
             self._begin()
         os.environ["PREFECT_API_URL"] = self._url
@@ -224,12 +224,13 @@ def no_answer(url: str) -> str:
     )
 
 
-def _recorded(home: Path) -> dict[str, Any] | None:
+def _recorded(home: Path) -> str | None:
+    """Address of the server that was last started there."""
     try:
-        found = json.loads((home / ADDRESS).read_text(encoding="utf-8"))
+        found: Json = json.loads((home / ADDRESS).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return found if isinstance(found, dict) and "url" in found else None
+    return str(found["url"]) if isinstance(found, dict) and "url" in found else None
 
 
 def _replace(path: Path, text: str) -> None:

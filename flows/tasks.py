@@ -7,7 +7,7 @@ Where Prefect's server is lost, the work goes on without it.
 
 from __future__ import annotations
 
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 from prefect import task
 from prefect.cache_policies import NO_CACHE
@@ -32,7 +32,7 @@ def unseen(value: T) -> T:
 
 
 @task(name="step", task_run_name="{step} {log_uri}", cache_policy=NO_CACHE, persist_result=False)
-def run_step(work: FlightWork, step: str, log_uri: str) -> State[Any]:
+def run_step(work: FlightWork, step: str, log_uri: str) -> State[dict[str, str | None]]:
     """One step of a flight, from the cache or run; the state says which."""
     work.do(step)
     run_key = work.records[step]["run_key"]

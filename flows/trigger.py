@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 from fieldcal.errors import FieldcalError
 from fieldcal.flows.server import answers, no_answer, serving_address
@@ -13,6 +13,8 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse.files import file_sha256
 
 if TYPE_CHECKING:
+    from uuid import UUID
+
     from prefect.client.orchestration import SyncPrefectClient
     from prefect.client.schemas.objects import FlowRun
 
@@ -56,7 +58,17 @@ def server_address(root: Path) -> str:
     return own
 
 
-def trigger(url: str, folder: Path, **changes: Any) -> dict[str, Any]:
+class Asked(TypedDict):
+    """The flow run of a session. `created` False: it had been asked for before; `digest` of the session's content."""
+
+    flow_run_id: str
+    name: str
+    state: str
+    created: bool
+    digest: str
+
+
+def trigger(url: str, folder: Path, **changes: str | int | None) -> Asked:
     """Create the flow run of a session, unless there is one for the same content already.
 
     A run that failed is followed by a new one. `changes` overrule parameters of the deployment.
@@ -86,12 +98,12 @@ def trigger(url: str, folder: Path, **changes: Any) -> dict[str, Any]:
                 "prefect.yaml.",
             ) from error
         run, created = _run_for(client, deployment.id, digest, {"folder": str(folder), **changes})
-        state = run.state.name if run.state else "Scheduled"
+        state = (run.state.name if run.state else None) or "Scheduled"
         return {"flow_run_id": str(run.id), "name": run.name, "state": state, "created": created, "digest": digest}
 
 
 def _run_for(
-    client: SyncPrefectClient, deployment: Any, digest: str, parameters: dict[str, Any]
+    client: SyncPrefectClient, deployment: UUID, digest: str, parameters: dict[str, str | int | None]
 ) -> tuple[FlowRun, bool]:
     """The run with this digest as idempotency key, and whether it is new; after one that failed, the next try's."""
     from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterIdempotencyKey

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -48,20 +48,21 @@ def rows_sha256(rows: pl.DataFrame, table: str) -> bytes:
     digest = hashlib.sha256()
     for name in columns:
         digest.update(name.encode())
-        _update(digest, ordered[name])
+        for part in _parts(ordered[name]):
+            digest.update(part)
     return digest.digest()
 
 
-def _update(digest: Any, column: pl.Series) -> None:
-    digest.update(column.is_null().to_numpy().tobytes())
+def _parts(column: pl.Series) -> Iterator[bytes]:
+    yield column.is_null().to_numpy().tobytes()
     if column.dtype == pl.String:
         texts = [text.encode() for text in column.fill_null("")]
-        digest.update(np.array([len(text) for text in texts], dtype="<i8").tobytes())
-        digest.update(b"".join(texts))
+        yield np.array([len(text) for text in texts], dtype="<i8").tobytes()
+        yield b"".join(texts)
     elif column.dtype == pl.Float64:
-        digest.update(column.fill_null(0.0).to_numpy().astype("<f8").tobytes())
+        yield column.fill_null(0.0).to_numpy().astype("<f8").tobytes()
     else:
-        digest.update(column.cast(pl.Int64).fill_null(0).to_numpy().astype("<i8").tobytes())
+        yield column.cast(pl.Int64).fill_null(0).to_numpy().astype("<i8").tobytes()
 
 
 def _canonical_json(text: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Unpack
 
 import polars as pl
 
@@ -13,6 +13,9 @@ from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES
 from fieldcal.warehouse.layout import encode_id, history_files, history_path, signal_files, signal_path
 from fieldcal.warehouse.signals import signal_ids
 from fieldcal.warehouse.store import empty_frame
+
+if TYPE_CHECKING:
+    from fieldcal.warehouse.sql import Limits, SqlValue
 
 DEFAULT_ROOT = "fieldcal-data"
 
@@ -53,7 +56,7 @@ class Warehouse:
         frame = _scan(files, table)
         return frame if flight_id is None else frame.filter(pl.col("flight_id") == flight_id)
 
-    def sql(self, query: str, parameters: Sequence[Any] | None = None, **limits: Any) -> pl.DataFrame:
+    def sql(self, query: str, parameters: Sequence[SqlValue] | None = None, **limits: Unpack[Limits]) -> pl.DataFrame:
         """Answer one SELECT over the history tables and views; limits as in `fieldcal.warehouse.sql.run_sql`.
 
         Raises

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Any
+
+from fieldcal.names import Json
 
 _SEAL = "sealed_sha256"
 _END = b"\n}\n"
@@ -15,8 +16,14 @@ class BrokenSeal(ValueError):
     """The record is torn or was changed after it was written."""
 
 
-def seal(record: Mapping[str, Any]) -> bytes:
-    """JSON of `record`, keys sorted, its digest in the last line. Plain JSON only: no NaN, no objects."""
+def seal(record: Mapping[str, object]) -> bytes:
+    """JSON of `record`, keys sorted, its digest in the last line.
+
+    Raises
+    ------
+    TypeError, ValueError
+        It is not plain JSON: an object (the types do not tell, since they know no typed dictionary as JSON), or NaN.
+    """
     body = {key: value for key, value in record.items() if key != _SEAL}
     if not body:
         raise ValueError("an empty record has nothing to seal")
@@ -24,7 +31,7 @@ def seal(record: Mapping[str, Any]) -> bytes:
     return text.removesuffix(_END) + _last_line(text)
 
 
-def unseal(data: bytes) -> dict[str, Any]:
+def unseal(data: bytes) -> dict[str, Json]:
     """The record of `seal`.
 
     Raises
@@ -36,7 +43,7 @@ def unseal(data: bytes) -> dict[str, Any]:
     if not comma or head + _last_line(head + _END) != data:
         raise BrokenSeal("it is not what was written")
     try:
-        record: dict[str, Any] = json.loads(data)
+        record: dict[str, Json] = json.loads(data)
     except ValueError as error:
         raise BrokenSeal("it is not JSON") from error
     del record[_SEAL]

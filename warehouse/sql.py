@@ -9,8 +9,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import date, datetime
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias, TypedDict
 
 import duckdb
 import polars as pl
@@ -39,10 +40,22 @@ _CONFIG: dict[str, str | bool | int | float | list[str]] = {
 }
 
 
+SqlValue: TypeAlias = str | bool | int | float | date | datetime | None
+"""What may stand for a `?` of a query."""
+
+
+class Limits(TypedDict, total=False):
+    """Limits of `run_sql`."""
+
+    timeout_s: float
+    memory_mb: int
+    max_result_mb: int
+
+
 def run_sql(
     root: Path,
     query: str,
-    parameters: Sequence[Any] | None = None,
+    parameters: Sequence[SqlValue] | None = None,
     *,
     timeout_s: float = 60.0,
     memory_mb: int = 1024,
@@ -87,7 +100,7 @@ def _named(query: str, texts: Mapping[str, str]) -> dict[str, str]:
 def _answer(
     root: Path,
     query: str,
-    parameters: Sequence[Any] | None,
+    parameters: Sequence[SqlValue] | None,
     views: Mapping[str, str],
     timeout_s: float,
     memory_mb: int,

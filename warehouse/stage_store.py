@@ -9,10 +9,11 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TypedDict, cast
 
 import polars as pl
 
+from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import write_bytes
@@ -21,6 +22,20 @@ from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 from fieldcal.warehouse.store import frame, read_arrow, write_table
 
 RECORD = "run.json"
+
+
+class StageOutput(TypedDict):
+    """A table that an execution wrote: the name of its file, and what that holds."""
+
+    file: str
+    sha256: str
+    bytes: int
+    rows: int
+
+
+def outputs_of(record: Mapping[str, Json]) -> dict[str, StageOutput]:
+    """The tables that a record lists. Its seal held, so that they are as `StageStore.save` wrote them."""
+    return cast(dict[str, StageOutput], record["outputs"])
 
 
 class StageStore:
@@ -33,11 +48,11 @@ class StageStore:
         """Where this execution's outputs are or would be."""
         return stage_folder(self.root, stage, flight_id, run_key)
 
-    def record(self, stage: str, flight_id: str, run_key: str) -> dict[str, Any] | None:
+    def record(self, stage: str, flight_id: str, run_key: str) -> dict[str, Json] | None:
         """What `save` was given as record, with `outputs` added; None when absent, torn or of another execution."""
         return _record(self.folder(stage, flight_id, run_key), stage, flight_id, run_key)
 
-    def complete(self, stage: str, flight_id: str, run_key: str) -> dict[str, Any] | None:
+    def complete(self, stage: str, flight_id: str, run_key: str) -> dict[str, Json] | None:
         """The record, if the execution is complete: every output there with the sha256 it says; else None.
 
         The record's `outputs` is `{table: {"file", "sha256", "bytes", "rows"}}`.
@@ -46,7 +61,7 @@ class StageStore:
         record = _record(folder, stage, flight_id, run_key)
         return None if record is None or any(broken_outputs(folder, record)) else record
 
-    def latest(self, stage: str, flight_id: str) -> dict[str, Any] | None:
+    def latest(self, stage: str, flight_id: str) -> dict[str, Json] | None:
         """The record last written for this stage of this flight, whatever its key; None when there is none."""
         found = self.folder(stage, flight_id, "any").parent.glob(f"*/{RECORD}")
         for path in sorted(found, key=lambda path: (_written_ns(path), path), reverse=True):
@@ -62,10 +77,10 @@ class StageStore:
         flight_id: str,
         run_key: str,
         tables: Mapping[str, pl.DataFrame],
-        record: Mapping[str, Any],
+        record: Mapping[str, object],
         *,
         units: Mapping[str, str] | None = None,
-    ) -> dict[str, Any]:
+    ) -> dict[str, Json]:
         """Write the outputs and, last, the record; the record as `complete` returns it.
 
         `record` is plain JSON (no NaN, no numpy values); the keys stage, flight_id, run_key and outputs are set here.
@@ -74,7 +89,7 @@ class StageStore:
         """
         folder = self.folder(stage, flight_id, run_key)
         prepare(self.root)
-        outputs = {}
+        outputs: dict[str, StageOutput] = {}
         for table, rows in tables.items():
             path = folder / f"{table}.parquet"
             sha256 = write_table(rows, table, path, stage=True, units=units, durable=False)
@@ -100,7 +115,7 @@ class StageStore:
             raise WarehouseError(
                 ReasonCode.STAGE_INCOMPLETE, f"{folder} holds no complete result of stage {stage}; run it again."
             )
-        outputs = record["outputs"]
+        outputs = outputs_of(record)
         wanted = list(outputs if tables is None else tables)
         if absent := [table for table in wanted if table not in outputs]:
             raise WarehouseError(
@@ -109,7 +124,7 @@ class StageStore:
         return {table: _output(folder, table, outputs[table]) for table in wanted}
 
 
-def _record(folder: Path, stage: str, flight_id: str, run_key: str) -> dict[str, Any] | None:
+def _record(folder: Path, stage: str, flight_id: str, run_key: str) -> dict[str, Json] | None:
     try:
         found = unseal((folder / RECORD).read_bytes())
     except (OSError, BrokenSeal):
@@ -125,10 +140,10 @@ def _written_ns(path: Path) -> int:
         return 0
 
 
-def broken_outputs(folder: Path, record: Mapping[str, Any]) -> Iterator[tuple[Path, str]]:
+def broken_outputs(folder: Path, record: Mapping[str, Json]) -> Iterator[tuple[Path, str]]:
     """Outputs that are not what the record says, each with what is wrong."""
-    for output in record["outputs"].values():
-        path = folder / str(output["file"])
+    for output in outputs_of(record).values():
+        path = folder / output["file"]
         try:
             data = path.read_bytes() if path.stat().st_size == output["bytes"] else b""
         except OSError:
@@ -138,8 +153,8 @@ def broken_outputs(folder: Path, record: Mapping[str, Any]) -> Iterator[tuple[Pa
             yield path, "its content is not what was written: the sha256 differs"
 
 
-def _output(folder: Path, table: str, output: Mapping[str, Any]) -> pl.DataFrame:
-    path = folder / str(output["file"])
+def _output(folder: Path, table: str, output: StageOutput) -> pl.DataFrame:
+    path = folder / output["file"]
     with disk(path, "read"):
         data = path.read_bytes()
     if hashlib.sha256(data).hexdigest() != output["sha256"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 from fieldcal.errors import FieldcalError
 from fieldcal.reason_codes import ReasonCode
@@ -14,14 +14,30 @@ from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import TEMPORARY, file_sha256
 from fieldcal.warehouse.layout import history_files
 from fieldcal.warehouse.sealed import BrokenSeal, unseal
-from fieldcal.warehouse.stage_store import RECORD, broken_outputs
+from fieldcal.warehouse.stage_store import RECORD, broken_outputs, outputs_of
 from fieldcal.warehouse.store import read_table
 
 Problem = tuple[str, str | None]
 """A path as shown, and what is wrong with it (None: nothing)."""
 
 
-def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path], str] | None = None) -> dict[str, Any]:
+class Damage(TypedDict):
+    """A file and what is wrong with it."""
+
+    path: str
+    reason: str
+
+
+class Verification(TypedDict):
+    """What `verify` found."""
+
+    ok: bool
+    files: int
+    damaged: list[Damage]
+    content_sha256: str | None
+
+
+def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path], str] | None = None) -> Verification:
     """Check `tables/`, `signals/`, complete stage outputs, what nights remember and, with `archive`, the logs.
 
     Nothing is changed.
@@ -53,7 +69,7 @@ def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path],
         if log_sha256 is None:
             raise ValueError("log_sha256 is needed to check an archive")
         found += _logs(root, archive, log_sha256)
-    damaged = [{"path": path, "reason": reason} for path, reason in found if reason is not None]
+    damaged: list[Damage] = [{"path": path, "reason": reason} for path, reason in found if reason is not None]
     readable = not any(path.startswith("tables/") for path, reason in found if reason is not None)
     content = content_sha256(root) if readable else None
     return {"ok": not damaged, "files": len(found), "damaged": damaged, "content_sha256": content}
@@ -90,8 +106,8 @@ def _stage_files(root: Path) -> Iterator[Problem]:
             continue
         yield shown, None
         broken = dict(broken_outputs(path.parent, record))
-        for output in record["outputs"].values():
-            file = path.parent / str(output["file"])
+        for output in outputs_of(record).values():
+            file = path.parent / output["file"]
             yield str(file.relative_to(root)), broken.get(file)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Unpack
 
 import polars as pl
 
@@ -13,6 +13,7 @@ from fieldcal.warehouse.questions import calibration_history, existing
 
 if TYPE_CHECKING:
     from fieldcal.exports.calibration import Constants
+    from fieldcal.warehouse.sql import Limits, SqlValue
 
 
 class Warehouse(query.Warehouse):
@@ -39,7 +40,7 @@ class Warehouse(query.Warehouse):
     fieldcal.warehouse.errors.WarehouseError: There is no warehouse at nowhere; ...
     """
 
-    def sql(self, query: str, parameters: Sequence[Any] | None = None, **limits: Any) -> pl.DataFrame:
+    def sql(self, query: str, parameters: Sequence[SqlValue] | None = None, **limits: Unpack[Limits]) -> pl.DataFrame:
         """Answer one SELECT over the history tables and views; it can only read.
 
         Parameters

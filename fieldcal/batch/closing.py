@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from fieldcal.batch.sources import TRENDS, sources
 from fieldcal.config.configuration import Alerts
+from fieldcal.names import Json
 from fieldcal.schemas import TABLES
 from fieldcal.schemas.arrow import VERSION_KEY
 from fieldcal.stages.run_key import run_key
@@ -59,7 +59,8 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
         table = Warehouse(root).scan("drift").collect()
         # With other limits than last time, what they make old is told whenever it passed them.
         limits = alerts.model_dump()
-        since = datetime.fromisoformat(before["at"]) if before.get("alerts") == limits else None
+        at = before.get("at")
+        since = datetime.fromisoformat(at) if isinstance(at, str) and before.get("alerts") == limits else None
         told = changes(former, table, last_usable(root), now=now, since=since, alerts=alerts)
         made = history_digest(root, ["drift"])
         record = {"at": now.isoformat(), "made_from": made_from, "made": made, "alerts": limits}
@@ -91,7 +92,7 @@ def _made_from(root: Path) -> str:
     return run_key(TRENDS, sources()[TRENDS], {}, {"history": history_digest(root, INPUTS)})
 
 
-def _remembered(root: Path) -> Mapping[str, Any]:
+def _remembered(root: Path) -> Mapping[str, Json]:
     try:
         return unseal(_place(root).read_bytes())
     except (OSError, BrokenSeal):

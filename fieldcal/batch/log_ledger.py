@@ -12,6 +12,7 @@ from pathlib import Path
 
 from fieldcal.batch.jobs import Ledger
 from fieldcal.flight.job import Job
+from fieldcal.names import Json
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import prepare
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
@@ -23,8 +24,8 @@ def read_ledger(root: Path) -> Ledger:
     """What is remembered; nothing where there is no whole ledger."""
     try:
         found = unseal(_place(root).read_bytes())["logs"]
-        return {path: (tuple(stamp), sha256) for path, (stamp, sha256) in found.items()}
-    except (OSError, BrokenSeal, KeyError, TypeError, ValueError):
+        return {path: _entry(entry) for path, entry in found.items()} if isinstance(found, dict) else {}
+    except (OSError, BrokenSeal, KeyError, ValueError):
         return {}
 
 
@@ -43,6 +44,13 @@ def write_ledger(root: Path, jobs: Iterable[Job]) -> None:
     prepare(root)
     entries = {path: [list(stamp), sha256] for path, (stamp, sha256) in {**kept, **now}.items()}
     write_bytes(_place(root), seal({"logs": entries}), durable=False)
+
+
+def _entry(entry: Json) -> tuple[tuple[int, ...], str]:
+    match entry:
+        case [[*stamp], str(sha256)]:
+            return tuple(number for number in stamp if isinstance(number, int)), sha256
+    raise ValueError(f"{entry!r} is no stamp with a sha256")
 
 
 def _place(root: Path) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from fieldcal.batch.jobs import find_jobs, without_copies
 from fieldcal.batch.log_ledger import read_ledger
@@ -49,5 +48,5 @@ def make_plan(root: Path, archive: Path, configuration: Configuration, session: 
 def _known(root: Path, archive: Path) -> tuple[dict[str, str], set[str]]:
     """Logs the history knows: flight_id → log_uri, and those of them that are in the archive."""
     rows = Warehouse(root).scan("flight").select("flight_id", "log_uri").sort("log_uri").collect()
-    known: dict[str, Any] = dict(rows.iter_rows())
+    known: dict[str, str] = dict(rows.iter_rows())
     return known, {uri for uri in known.values() if (archive / uri).exists()}

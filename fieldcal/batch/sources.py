@@ -43,10 +43,11 @@ def know_sources(root: Path, *, keep: bool) -> None:
     place = root / "night" / "sources.json"
     try:
         found = unseal(place.read_bytes())
-        if found["code"] == code_digest() and set(found["sources"]) == set(NAMES):
-            _known.update(found["sources"])
+        digests = found["sources"]
+        if found["code"] == code_digest() and isinstance(digests, dict) and set(digests) == set(NAMES):
+            _known.update({name: str(digest) for name, digest in digests.items()})
             return
-    except (OSError, BrokenSeal, KeyError, TypeError):
+    except (OSError, BrokenSeal, KeyError):
         pass
     if keep:
         write_bytes(place, seal({"code": code_digest(), "sources": dict(sources())}), durable=False)

@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import polars as pl
 
@@ -276,7 +276,7 @@ def _record(
     }
 
 
-def _of_store(stored: dict[str, Any]) -> Record:
+def _of_store(stored: dict[str, Json]) -> Record:
     """A record as the warehouse gives it back: what was handed to it, with the outputs."""
     return cast(Record, stored)
 

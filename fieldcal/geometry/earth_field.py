@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from functools import lru_cache
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
@@ -15,13 +15,28 @@ from fieldcal.reason_codes import ReasonCode
 UNIT_IN_TESLA = {"T": 1.0, "uT": 1e-6, "G": 1e-4}
 
 
+class _Field(Protocol):
+    """North, east, down; nanotesla."""
+
+    x: float
+    y: float
+    z: float
+
+
+class _Model(Protocol):
+    """pygeomag's, which has no types of its own; degrees, kilometres, decimal year."""
+
+    def calculate(self, *, glat: float, glon: float, alt: float, time: float) -> _Field: ...
+
+
 @lru_cache(maxsize=4)
-def _model(year: int) -> Any:
+def _model(year: int) -> _Model:
     """The five-year model that covers a year."""
     from pygeomag import GeoMag
 
     epoch = min(2025, max(2010, year - year % 5))
-    return GeoMag(coefficients_file=f"wmm/WMM_{epoch}.COF")
+    model: _Model = GeoMag(coefficients_file=f"wmm/WMM_{epoch}.COF")
+    return model
 
 
 def world_magnetic_model(latitude_deg: float, longitude_deg: float, altitude_m: float, when: datetime) -> Array:

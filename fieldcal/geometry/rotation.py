@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fieldcal.geometry.intervals import interval_of, share_of_interval
 
-Array = NDArray[np.floating[Any]]
+Array = NDArray[np.floating[Any]]  # of any width, because numpy.linalg's answers are so to the type check
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 """The quaternion of no rotation."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from fieldcal.config.values import UNITS
 from fieldcal.names import SENSORS, Sensor
 from fieldcal.reason_codes import ReasonCode
 
-Columns = dict[str, NDArray[Any]]
+Columns = dict[str, NDArray[np.int64 | np.float64]]
 Batch = tuple[str, Columns]
 
 UNKNOWN_UNIT = "unknown"

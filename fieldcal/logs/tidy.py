@@ -68,7 +68,9 @@ class TidySignal:
         UnreadableLog
             `too_disordered`: so many rows would have to be held to put them in order.
         """
-        frame = self._finite(batch_frame(self.table, {**columns, "t_ns": self._unwrap(columns["t_ns"])}))
+        frame = self._finite(
+            batch_frame(self.table, {**columns, "t_ns": self._unwrap(np.asarray(columns["t_ns"], np.int64))})
+        )
         if frame.is_empty():
             return
         t = frame["t_ns"].to_numpy()

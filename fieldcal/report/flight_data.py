@@ -19,7 +19,7 @@ from fieldcal.schemas import SIGNAL_TABLES, SchemaMismatch
 from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.questions import existing
-from fieldcal.warehouse.stage_store import StageStore
+from fieldcal.warehouse.stage_store import StageStore, outputs_of
 from fieldcal.words.rows import Row, rows_of, unfolded
 
 STAGE_TABLES = ("manoeuvre.segments", "smoothing.samples", "attitude_pass2.attitude", "vps_sync.vps_aligned")
@@ -154,14 +154,16 @@ def _stages(
         if stage == "ingest" or row["status"] == Status.FAILED:
             continue
         record = store.record(stage, flight_id, str(row["run_key"]))
-        parameters |= (record or {}).get("params") or {}
+        params = (record or {}).get("params")
+        if isinstance(params, Mapping):
+            parameters |= params
         wanted = [name for name in STAGE_TABLES if name.split(".")[0] == stage]
         if record is None:
             gone.append(stage)
             continue
         for name in wanted:
             table = name.split(".")[1]
-            if table not in record["outputs"]:
+            if table not in outputs_of(record):
                 continue
             try:
                 tables[name] = store.load(stage, flight_id, row["run_key"], [table])[table]

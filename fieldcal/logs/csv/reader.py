@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -151,7 +150,9 @@ class CsvTable:
         assert self._csv.rate_hz is not None
         return self._csv.rate_hz
 
-    def _times(self, frame: pl.DataFrame, place: int | None, places: NDArray[np.int64]) -> tuple[Any, Any]:
+    def _times(
+        self, frame: pl.DataFrame, place: int | None, places: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Nanoseconds of each row, and where they are sound."""
         if place is None:
             return sample_times(places, self._rate_hz()), np.ones(len(places), bool)
@@ -193,7 +194,7 @@ class CsvTable:
                 continue
             batch: BatchColumns = {"t_ns": t_ns[kept], **{out: column[kept] for out, column in values.items()}}
             self._summary.count_rows(table, batch)
-            self._summary.epoch_known |= columns.time is not None and stamps_are_epoch(batch["t_ns"])
+            self._summary.epoch_known |= columns.time is not None and stamps_are_epoch(t_ns[kept])
             yield table, batch
 
     def _numeric(self) -> list[str]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +64,11 @@ class Decoder(Protocol):
 
 
 def decode_each(
-    read: Any, wants: Mapping[str, Want], data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64]
+    read: Callable[[bytes], tuple[int | None, list[list[float]]]],
+    wants: Mapping[str, Want],
+    data: NDArray[np.uint8],
+    starts: NDArray[np.int64],
+    sizes: NDArray[np.int64],
 ) -> Decoded:
     """Decode message by message with `read(bytes) -> (stamp_ns or None, list of number lists)`.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from fieldcal.logs.encodings.decoded import (
     Want,
     decode_each,
 )
+from fieldcal.names import Json
 
 
 class JsonDecoder:
@@ -32,11 +32,11 @@ class JsonDecoder:
         return decode_each(self._read, self._wants, data, starts, sizes)
 
     def _read(self, payload: bytes) -> tuple[int | None, list[list[float]]]:
-        message = json.loads(payload)
+        message: Json = json.loads(payload)
         return _stamp(message), [_numbers(message, want) for want in self._wants.values()]
 
 
-def _stamp(message: dict[str, Any]) -> int | None:
+def _stamp(message: Json) -> int | None:
     for path in STAMP_FIELDS:
         try:
             stamp = _field(message, path)
@@ -47,29 +47,40 @@ def _stamp(message: dict[str, Any]) -> int | None:
         seconds = [stamp[name] for name in SECOND_NAMES if name in stamp]
         nanoseconds = [stamp[name] for name in NANOSECOND_NAMES if name in stamp]
         if seconds:
-            return int(seconds[0]) * NANOSECONDS + int(nanoseconds[0] if nanoseconds else 0)
+            return _whole(seconds[0]) * NANOSECONDS + _whole(nanoseconds[0] if nanoseconds else 0)
     return None
 
 
-def _numbers(message: dict[str, Any], want: Want) -> list[float]:
+def _whole(value: Json) -> int:
+    if not isinstance(value, str | int | float):
+        raise TypeError("not a number")
+    return int(value)
+
+
+def _numbers(message: Json, want: Want) -> list[float]:
     if len(want.paths) > 1:
         return [_number(_field(message, path)) for path in want.paths]
     value = _field(message, want.paths[0])
     if want.width == 1:
         return [_number(value)]
-    parts = value if isinstance(value, list) else [value[component] for component in COMPONENTS[want.width]]
+    if isinstance(value, dict):
+        parts: list[Json] = [value[component] for component in COMPONENTS[want.width]]
+    elif isinstance(value, list):
+        parts = value
+    else:
+        raise TypeError("neither an array nor an object")
     if len(parts) != want.width:
         raise ValueError(f"{want.paths[0]} holds {len(parts)} numbers, not {want.width}")
     return [_number(part) for part in parts]
 
 
-def _number(value: Any) -> float:
+def _number(value: Json) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError("not a number")
     return float(value)
 
 
-def _field(message: Any, path: str) -> Any:
+def _field(message: Json, path: str) -> Json:
     for name in path.split("."):
         if not isinstance(message, dict):
             raise KeyError(name)

@@ -100,6 +100,8 @@ class ProtobufDecoder:
         return True
 
 
+# Any, here and below: protobuf makes its classes at run time, so that no type knows their fields; `decode_each` makes
+# numbers of what they hold.
 def _value(message: Any, path: str) -> Any:
     """The value at a dotted path. Raises ValueError where a message on the way is not set."""
     *parents, last = path.split(".")

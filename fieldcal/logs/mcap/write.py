@@ -16,7 +16,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -28,6 +28,8 @@ from fieldcal.logs.mcap.roles import METADATA_NAME, RAW_IMU
 
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 ENCODINGS = ("cdr", "json")
+NumberArray = NDArray[np.uint16 | np.int64 | np.float64]
+Message: TypeAlias = "dict[str, Message | str | float | list[float]]"
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class MessageChannel:
     type_name: str
     t_ns: NDArray[np.int64]
     log_time_ns: NDArray[np.int64]
-    values: Mapping[str, NDArray[Any]]
+    values: Mapping[str, NumberArray]
     texts: Mapping[str, str] = field(default_factory=dict)
     definition: str | None = None
 
@@ -188,7 +190,7 @@ def write_mcap(
     order = np.argsort(np.concatenate(log_times), kind="stable")
     places = np.concatenate([np.arange(len(times)) for times in log_times])
     with path.open("wb") as stream:
-        writer: Any = Writer(stream, chunk_size=chunk_size, compression=COMPRESSIONS[compression])
+        writer = Writer(stream, chunk_size=chunk_size, compression=COMPRESSIONS[compression])
         writer.start(profile="ros2" if encoding == "cdr" else "", library="fieldcal")
         if metadata:
             writer.add_metadata(METADATA_NAME, dict(metadata))
@@ -197,7 +199,7 @@ def write_mcap(
         times = [channel.log_time_ns.tolist() for channel in channels]
         for owner, place in zip(owners[order].tolist(), places[order].tolist(), strict=True):
             writer.add_message(ids[owner], times[owner][place], payloads[owner][place], stamps[owner][place], place)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap's own lacks it
 
 
 def encode_cdr(channel: MessageChannel, byte_order: str = "<") -> NDArray[np.void]:
@@ -247,18 +249,20 @@ def _payloads(channel: MessageChannel, encoding: str) -> list[bytes]:
 def _json_messages(channel: MessageChannel) -> Iterator[bytes]:
     lists = {path: values.tolist() for path, values in _components(channel)}
     for row in range(len(channel.t_ns)):
-        message: dict[str, Any] = {}
+        message: Message = {}
         flat = {**channel.texts, **{path: values[row] for path, values in lists.items()}}
         for path, value in flat.items():
             *parents, last = path.split(".")
             target = message
             for parent in parents:
-                target = target.setdefault(parent, {})
+                inner = target.setdefault(parent, {})
+                assert isinstance(inner, dict)  # no field of a message is a number and a message
+                target = inner
             target[last] = value
         yield json.dumps(message).encode()
 
 
-def _components(channel: MessageChannel) -> Iterator[tuple[str, NDArray[Any]]]:
+def _components(channel: MessageChannel) -> Iterator[tuple[str, NumberArray]]:
     """Every given value by the path of its number or array of numbers."""
     arrays = {leaf.path for leaf in flatten(channel.type_name, channel.schema_text) if isinstance(leaf, Numbers)}
     yield "header.stamp.sec", channel.t_ns // NANOSECONDS
@@ -271,7 +275,7 @@ def _components(channel: MessageChannel) -> Iterator[tuple[str, NDArray[Any]]]:
                 yield f"{path}.{component}", values[:, number]
 
 
-def _register(writer: Any, channel: MessageChannel, encoding: str) -> int:
+def _register(writer: Writer, channel: MessageChannel, encoding: str) -> int:
     if encoding == "cdr":
         schema = writer.register_schema(channel.schema_name, "ros2msg", channel.schema_text.encode())
     else:
@@ -284,7 +288,7 @@ def _stamped(
     type_name: str,
     t_ns: ArrayLike,
     log_time_ns: ArrayLike | None,
-    values: Mapping[str, NDArray[Any]],
+    values: Mapping[str, NumberArray],
     frame_id: str,
     definition: str | None = None,
 ) -> MessageChannel:
@@ -296,7 +300,7 @@ def _stamped(
     return MessageChannel(topic, type_name, stamps, times, values, {"header.frame_id": frame_id}, definition)
 
 
-def _vectors(values: ArrayLike, width: int, *, keep_type: bool = False) -> NDArray[Any]:
+def _vectors(values: ArrayLike, width: int, *, keep_type: bool = False) -> NumberArray:
     array = np.asarray(values)
     if array.ndim != 2 or array.shape[1] != width:
         raise ValueError(f"expected an array of shape (n, {width}), got {array.shape}")
