@@ -29,7 +29,7 @@ def require_determined(
         `too_little_motion`, `scale_uncertain`, `not_a_sphere` or `scale_not_nominal`; `measured` has all the numbers.
     """
     measured = fit.measured()
-    relative = max(measured["scale_relative_sd"])
+    relative = max(fit.scale_relative_sd)
     if not fit.condition <= max_condition:
         raise UnusableFlight(
             ReasonCode.TOO_LITTLE_MOTION,
