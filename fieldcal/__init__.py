@@ -46,33 +46,6 @@ from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
 
-if TYPE_CHECKING:
-    from fieldcal.api.calibration import Calibration, calibrate
-    from fieldcal.api.clock_sync import Synchronisation, synchronise
-    from fieldcal.api.constants import apply, export
-    from fieldcal.api.ellipsoid import EllipsoidFit, fit_ellipsoid
-    from fieldcal.api.estimate import Estimate
-    from fieldcal.api.joint import JointEstimate, fit_joint
-    from fieldcal.api.output_error import OutputErrorFit, fit_output_error
-    from fieldcal.api.plot import plot
-    from fieldcal.api.recording import Recording, read_log
-    from fieldcal.api.sensor import SensorCalibration
-    from fieldcal.api.vps_clock import VpsClock
-    from fieldcal.api.warehouse import Warehouse
-    from fieldcal.errors import (
-        ConfigurationError,
-        EstimationError,
-        FieldcalError,
-        Refused,
-        UnreadableLog,
-        UnusableFlight,
-    )
-    from fieldcal.exports.apply import CalibratedReadings
-    from fieldcal.exports.calibration import Constants, Export, Triad
-    from fieldcal.simulation.archive import write_flights
-    from fieldcal.simulation.experiment import Experiment, simulate
-    from fieldcal.warehouse.errors import WarehouseError
-
 __all__ = [
     "CalibratedReadings",
     "Calibration",
@@ -166,7 +139,33 @@ _NAMES_OF = {
 }
 """Module → public names. They are loaded when they are asked for: `fieldcal --help` needs none of them."""
 
-if not TYPE_CHECKING:  # mypy would let every misspelt name pass
+if TYPE_CHECKING:
+    from fieldcal.api.calibration import Calibration, calibrate
+    from fieldcal.api.clock_sync import Synchronisation, synchronise
+    from fieldcal.api.constants import apply, export
+    from fieldcal.api.ellipsoid import EllipsoidFit, fit_ellipsoid
+    from fieldcal.api.estimate import Estimate
+    from fieldcal.api.joint import JointEstimate, fit_joint
+    from fieldcal.api.output_error import OutputErrorFit, fit_output_error
+    from fieldcal.api.plot import plot
+    from fieldcal.api.recording import Recording, read_log
+    from fieldcal.api.sensor import SensorCalibration
+    from fieldcal.api.vps_clock import VpsClock
+    from fieldcal.api.warehouse import Warehouse
+    from fieldcal.errors import (
+        ConfigurationError,
+        EstimationError,
+        FieldcalError,
+        Refused,
+        UnreadableLog,
+        UnusableFlight,
+    )
+    from fieldcal.exports.apply import CalibratedReadings
+    from fieldcal.exports.calibration import Constants, Export, Triad
+    from fieldcal.simulation.archive import write_flights
+    from fieldcal.simulation.experiment import Experiment, simulate
+    from fieldcal.warehouse.errors import WarehouseError
+else:  # mypy is not shown this: it would let every misspelt name pass
 
     def __getattr__(name: str) -> object:
         from importlib import import_module

@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 
 import fieldcal
+from fieldcal.provenance.reached_code import reach
+from fieldcal.provenance.source_tree import installed
+from fieldcal.stages.pipeline import PIPELINE, Stage
 
 REPOSITORY = Path(__file__).parents[2]
 SCRIPT = """
@@ -82,3 +85,17 @@ def test_nothing_heavy_is_loaded_before_it_is_asked_for() -> None:
     )
     told = subprocess.run([sys.executable, "-c", program], cwd=REPOSITORY, capture_output=True, text=True)
     assert told.stdout.split("\n")[:2] == ["[]", "[]"]
+
+
+@pytest.mark.parametrize("stage", PIPELINE, ids=lambda stage: stage.name)
+def test_public_names_have_no_part_in_what_a_stage_is_known_by(stage: Stage) -> None:
+    """Every module imports `fieldcal`: were its names followed, any change would run every stage again."""
+    reached = reach(installed("fieldcal"), [f"{stage.function.__module__}.{stage.function.__name__}"])
+    assert "fieldcal" in reached.modules
+    assert not {name for name in reached.modules if name.startswith(("fieldcal.api", "fieldcal.cli", "fieldcal.plots"))}
+
+
+def test_a_function_called_as_its_module_is_found() -> None:
+    """`from fieldcal.exports.px4 import px4` in the package: the path may mean either, and leads to both."""
+    reached = reach(installed("fieldcal"), ["fieldcal.exports.FORMATS"])
+    assert {("fieldcal.exports.px4", "px4"), ("fieldcal.exports.yaml_text", "ros")} <= reached.definitions
