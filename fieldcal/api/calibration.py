@@ -18,7 +18,7 @@ from fieldcal.exports.calibration import Constants
 from fieldcal.flight.calibrate import CalibratedLog, LogRead, identify, overruled, read, run_stages
 from fieldcal.flight.rows import rows_frame
 from fieldcal.geometry import sensor_model
-from fieldcal.names import PREFERRED_METHODS, SENSORS, Sensor
+from fieldcal.names import PREFERRED_METHODS, SENSORS
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.tables import matrix, seconds
 from fieldcal.stages.vps import RATE_COLUMNS
@@ -180,7 +180,7 @@ class Calibration:
         """
         own = [self.sensor(name) for name in SENSORS]
         flight = self.document["flight"]
-        triads = {Sensor(s.sensor): s.triad(f"flight {flight['flight_id']}, {s.method}") for s in own if s.ok}
+        triads = {s.sensor: s.triad(f"flight {flight['flight_id']}, {s.method}") for s in own if s.ok}
         if not triads:
             raise Refused(
                 ReasonCode(own[0].scale.reason_code or ReasonCode.NO_CALIBRATION),

@@ -27,7 +27,7 @@ from fieldcal.stages.tables import columns_of, matrix, triad
 from fieldcal.warehouse.errors import disk
 from fieldcal.warehouse.store import TableWriter
 
-TABLE_OF = {Sensor.GYROSCOPE: "imu", Sensor.ACCELEROMETER: "imu", Sensor.MAGNETOMETER: "magnetometer"}
+TABLE_OF: dict[str, str] = {Sensor.GYROSCOPE: "imu", Sensor.ACCELEROMETER: "imu", Sensor.MAGNETOMETER: "magnetometer"}
 FLU_FROM_FRD = FRD_FROM_FLU.T
 SPECIFIC_FORCE = {"gravity": -1.0, "specific_force": 1.0}
 
@@ -62,7 +62,7 @@ class CalibratedReadings:
     (['accelerometer', 'gyroscope', 'magnetometer'], ['calibrated.mcap'])
     """
 
-    readings: dict[Sensor, tuple[np.ndarray, Array]]
+    readings: dict[str, tuple[np.ndarray, Array]]
     temperature: pl.DataFrame | None
     settings: FlightSettings
     constants: Constants
@@ -105,7 +105,8 @@ def apply_constants(
         raise FieldcalError(ReasonCode.NOT_USABLE, f"{log}: {facts['reason']}")
     settings = ingest.settings_of(facts, vehicle)
     temperature = signals.get("temperature") if follow_temperature else None
-    readings, warnings = {}, []
+    readings: dict[str, tuple[np.ndarray, Array]] = {}
+    warnings: list[str] = []
     for name in INERTIAL_FIRST:
         table = signals.get(TABLE_OF[name])
         if table is None or table.is_empty() or table[f"{name}_x"].null_count() == table.height:

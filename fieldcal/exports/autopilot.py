@@ -24,7 +24,7 @@ SYMMETRY = 1e-9
 """A matrix is symmetric when its halves differ by less than this share of it."""
 
 
-def in_autopilot_units(constants: Constants, magnetic_unit: float) -> tuple[dict[Sensor, Triad], list[str]]:
+def in_autopilot_units(constants: Constants, magnetic_unit: float) -> tuple[dict[str, Triad], list[str]]:
     """Triads with zeros in rad/s, m/s² and gauss / `magnetic_unit`, scales without unit; and why one is left out."""
     triads, warnings = {}, []
     for sensor, triad in constants.triads.items():
@@ -58,7 +58,7 @@ def in_autopilot_units(constants: Constants, magnetic_unit: float) -> tuple[dict
     return triads, warnings
 
 
-def not_held(triads: dict[Sensor, Triad], target: str, thermal_magnetometer: bool = False) -> list[str]:
+def not_held(triads: dict[str, Triad], target: str, thermal_magnetometer: bool = False) -> list[str]:
     """Sentences on what the targets' common model leaves out."""
     warnings = []
     if (gyroscope := triads.get(Sensor.GYROSCOPE)) is not None:

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import Sensor
 
 
 def cubic_about(first: Array, second: Array, third: Array, by_degc: float) -> tuple[Array, Array, Array]:
@@ -105,7 +104,7 @@ class Constants:
 
     vehicle_id: str
     imu_id: str
-    triads: Mapping[Sensor, Triad]
+    triads: Mapping[str, Triad]
     as_of: str
 
     @property

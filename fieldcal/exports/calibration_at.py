@@ -45,7 +45,9 @@ def constants_of(root: Path, vehicle_id: str, temperature_degc: float | None = N
         )
     last = rows.sort("started_at", "flight_id", nulls_last=False).row(-1, named=True)
     rows = rows.filter(pl.col("imu_id") == last["imu_id"])
-    triads = {s: triad for s in INERTIAL_FIRST if (triad := _triad(rows.filter(sensor=s), at)) is not None}
+    triads: dict[str, Triad] = {
+        s: triad for s in INERTIAL_FIRST if (triad := _triad(rows.filter(sensor=s), at)) is not None
+    }
     if not triads:
         raise FieldcalError(
             ReasonCode.NO_CALIBRATION,

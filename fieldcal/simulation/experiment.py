@@ -12,7 +12,7 @@ import numpy as np
 from numpy.random import Generator
 
 from fieldcal.geometry.rotation import Array, body_from_inertial, from_euler, from_rotation_vector, multiply, normalise
-from fieldcal.names import SENSORS, Sensor
+from fieldcal.names import SENSORS
 
 TICK_S = 25.6e-6
 BAND_LIMIT_HZ = 50.0
@@ -96,7 +96,7 @@ class Recording:
 
     experiment: Experiment
     t: Array
-    counts: dict[Sensor, Array]
+    counts: dict[str, Array]
     temperature: Array
     vps_t: Array
     vps_q: Array
@@ -255,7 +255,7 @@ def simulate(experiment: Experiment | None = None, **changes: object) -> Recordi
     delay_s = 2 * DAMPING / (2 * np.pi * BAND_LIMIT_HZ) if e.band_limit else 0.0
     temperature = np.interp(t, [0.0, e.duration_s], e.temperature_degc)
     sensed = _sensed(e, motion, t, streams)
-    counts = {name: _counts(e, name, sensed[name], temperature) for name in SENSORS}
+    counts: dict[str, Array] = {name: _counts(e, name, sensed[name], temperature) for name in SENSORS}
     world, body = (
         from_rotation_vector(e.vps_misalignment_rad * _unit(streams["vps"])),
         from_rotation_vector(e.vps_misalignment_rad * _unit(streams["vps"])),

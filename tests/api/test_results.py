@@ -41,7 +41,7 @@ def test_a_recording_tells_what_was_read(log: Path) -> None:
     t, readings = recording.readings("magnetometer")
     assert t[0] == 0.0
     assert readings.shape == (recording.facts["rows"]["magnetometer"], 3)
-    with pytest.raises(ValueError, match="one of gyroscope"):
+    with pytest.raises(ValueError, match="sensor is one of"):
         recording.readings("barometer")
 
 
@@ -129,7 +129,16 @@ def test_constants_leave_refused_sensors_out(refused: fieldcal.Calibration) -> N
 def test_an_axis_that_was_not_refused_can_be_asked_for() -> None:
     nan = np.full(3, np.nan)
     estimate = fieldcal.Estimate(
-        "gyroscope", "joint", "scale", "1", nan, None, ("ok", "refused", "ok"), "a_code", "Why.", np.eye(3) * 2.0
+        "gyroscope",
+        "joint",
+        "scale",
+        "1",
+        nan,
+        None,
+        ("ok", "refused", "ok"),
+        "axis_not_turned",
+        "Why.",
+        np.eye(3) * 2.0,
     )
     assert (estimate["x"], estimate["xy"], estimate["zz"]) == (2.0, 0.0, 2.0)
     for axis in ("y", "yx"):
