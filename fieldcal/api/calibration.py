@@ -18,8 +18,9 @@ from fieldcal.exports.calibration import Constants
 from fieldcal.flight.calibrate import CalibratedLog, LogRead, identify, overruled, read, run_stages
 from fieldcal.flight.rows import rows_frame
 from fieldcal.geometry import sensor_model
-from fieldcal.names import PREFERRED_METHODS, SENSORS
+from fieldcal.names import PREFERRED_METHODS, SENSORS, Json
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas.rows import FlightDocument, Refusable, SyncRow
 from fieldcal.stages.tables import matrix, seconds
 from fieldcal.stages.vps import RATE_COLUMNS
 from fieldcal.words.flights import is_consequence
@@ -115,7 +116,7 @@ class Calibration:
     _log: CalibratedLog = field(repr=False)
 
     @property
-    def document(self) -> dict[str, Any]:
+    def document(self) -> FlightDocument:
         """Flight, calibration, fit, sync and run, named as the columns of those tables."""
         return self._log.document
 
@@ -223,7 +224,7 @@ class Calibration:
     def _why_none(self, sensor: str) -> tuple[str, str]:
         """Code and sentence for a sensor without numbers: the stage that had nothing to go on, or what it lacked."""
         stopped = [run for run in self.runs if run.status in ("refused", "failed")]
-        causes = [run for run in stopped if not is_consequence({"stage": run.stage, **_code_and_status(run)})]
+        causes = [run for run in stopped if not is_consequence(_refusable(run))]
         own = [run for run in causes if run.stage in STAGES[sensor]]
         for run in (*own, *causes):
             return run.reason_code or "refused", run.reason or f"stage {run.stage} ended {run.status}."
@@ -359,7 +360,7 @@ def _calibration(log: LogRead) -> Calibration:
             run["stage"],
             run["status"],
             run["reason_code"],
-            run["measured"].get("reason"),
+            _sentence(run["measured"].get("reason")),
             {name: number for name, number in run["measured"].items() if name != "reason"},
         )
         for run in document["run"]
@@ -378,7 +379,7 @@ def _calibration(log: LogRead) -> Calibration:
     return without if document["sync"] is None else _with_clock(without, document["sync"])
 
 
-def _with_clock(c: Calibration, row: Mapping[str, Any]) -> Calibration:
+def _with_clock(c: Calibration, row: SyncRow) -> Calibration:
     run = next(run for run in c.runs if run.stage == "vps_sync")
     imu, vps = c._rates(), c._vps_rates()
     clock = VpsClock(
@@ -393,8 +394,12 @@ def _with_clock(c: Calibration, row: Mapping[str, Any]) -> Calibration:
     return replace(c, sync=clock)
 
 
-def _code_and_status(run: StageRun) -> dict[str, str | None]:
-    return {"reason_code": run.reason_code, "status": run.status}
+def _refusable(run: StageRun) -> Refusable:
+    return {"stage": run.stage, "reason_code": run.reason_code, "status": run.status}
+
+
+def _sentence(told: Json) -> str | None:
+    return None if told is None else str(told)
 
 
 def _diagonal(x: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Literal
 
 import polars as pl
 
@@ -13,14 +13,19 @@ from fieldcal.cli.progress import NightProgress
 from fieldcal.cli.show import console, table
 from fieldcal.flows.run import run_night
 from fieldcal.names import SENSORS
-from fieldcal.simulation.archive import write_flights
+from fieldcal.schemas.rows import CalibrationRow
+from fieldcal.simulation.archive import Truth, write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.numbers import number, with_sd
-from fieldcal.words.rows import Row
+from fieldcal.words.rows import typed
 from fieldcal.words.talk import say
 
+if TYPE_CHECKING:
+    from rich.table import Table
+
 VEHICLES, SESSIONS, FLIGHTS = 2, 2, 1
+PARAMETERS: tuple[Literal["scale", "zero"], ...] = ("scale", "zero")
 BEST_METHODS = {"magnetometer": "ellipsoid_robust", "accelerometer": "ellipsoid_robust", "gyroscope": "output_error"}
 QUESTIONS = (
     "SELECT vehicle_id, sensor, axis, value_at_25degc, sd FROM latest_calibration WHERE parameter = 'scale'",
@@ -40,7 +45,7 @@ def run_demo(folder: Path, root: Path, config: Path | None) -> bool:
     out = console()
     print_night(out, result, root)
     uri = logs[0].relative_to(archive).as_posix()
-    truth = json.loads(logs[0].with_name(logs[0].stem + ".truth.json").read_text(encoding="utf-8"))
+    truth: Truth = json.loads(logs[0].with_name(logs[0].stem + ".truth.json").read_text(encoding="utf-8"))
     flight = next(log["flight_id"] for log in result["logs"] if log["log_uri"] == uri)
     out.print(_beside_truth(root, flight, truth, uri))
     out.print("Ask next:", markup=False)
@@ -49,28 +54,28 @@ def run_demo(folder: Path, root: Path, config: Path | None) -> bool:
     return bool(result["ok"] != len(result["logs"]))
 
 
-def _beside_truth(root: Path, flight_id: str, truth: Row, uri: str) -> Any:
+def _beside_truth(root: Path, flight_id: str, truth: Truth, uri: str) -> Table:
     """Scale and zero of one flight, with sd, the truth, and the error in sd and per cent."""
     rows = Warehouse(root).scan("calibration", flight_id=flight_id).filter(pl.col("parameter").is_in(["scale", "zero"]))
     found = {
         (row["sensor"], row["method"], row["parameter"], row["axis"]): row
-        for row in rows.collect().iter_rows(named=True)
+        for row in typed(rows.collect().iter_rows(named=True), CalibrationRow)
     }
     lines = []
     for sensor in SENSORS:
         for i, axis in enumerate("xyz"):
-            for parameter in ("scale", "zero"):
+            for parameter in PARAMETERS:
                 row = found.get((sensor, BEST_METHODS[sensor], parameter, axis))
                 true = truth["constants"][sensor][parameter][i]
                 if row is not None and row["value"] is not None:
-                    lines.append(
-                        [sensor, parameter, axis, with_sd(row["value"], row["sd"]), number(true, 6), *_error(row, true)]
-                    )
+                    value, sd = row["value"], row["sd"]
+                    found_and_true = (with_sd(value, sd), number(true, 6), *_error(value, sd, true))
+                    lines.append([sensor, parameter, axis, *found_and_true])
     columns = ["sensor", "parameter", "axis", "found", "truth", "error %", "error in sd"]
     return table(columns, lines, f"{uri} beside the truth of the simulation")
 
 
-def _error(row: Row, true: float) -> tuple[str, str]:
-    error = row["value"] - true
-    in_sd = f"{error / row['sd']:+.1f}" if row["sd"] else "–"
+def _error(value: float, sd: float | None, true: float) -> tuple[str, str]:
+    error = value - true
+    in_sd = f"{error / sd:+.1f}" if sd else "–"
     return f"{100 * error / abs(true):+.2f}", in_sd

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from fieldcal.cli.show import table
 from fieldcal.names import Status
-from fieldcal.words.flights import QUANTITIES, Rows, advised, is_consequence, sync_sentence, verdict_sentence
+from fieldcal.schemas.rows import CalibrationRow, FitRow, FlightDocument, UnfoldedRun
+from fieldcal.words.flights import QUANTITIES, advised, is_consequence, sync_sentence, verdict_sentence
 from fieldcal.words.numbers import cell, number, with_sd
-from fieldcal.words.rows import Row
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 AXES = ("x", "y", "z")
 PARAMETERS = ("scale", "zero", "bias")
 
 
-def print_flight(console: Console, document: Row) -> None:
+def print_flight(console: Console, document: FlightDocument) -> None:
     """Print what `fieldcal.flight.calibrate.calibrate_log` found."""
     flight = document["flight"]
     console.print(verdict_sentence(flight), markup=False)
-    for finding in flight["findings"]:
+    for finding in flight["findings"] or []:
         if finding["sentence"] != flight["reason"]:
             console.print(f"  {finding['sentence']}", markup=False)
     if document["calibration"]:
@@ -34,7 +38,7 @@ def print_flight(console: Console, document: Row) -> None:
         console.print(sync_sentence(document["sync"]), markup=False)
 
 
-def parameter_table(rows: Rows) -> Any:
+def parameter_table(rows: Sequence[CalibrationRow]) -> Table:
     """scale, zero and bias of every sensor and method, an axis a line. A refused axis says so."""
     by_place = {(r["sensor"], r["method"], r["axis"], r["parameter"]): r for r in rows}
     lines = []
@@ -52,17 +56,17 @@ def parameter_table(rows: Rows) -> Any:
     return table(["sensor", "method", "axis", *PARAMETERS, "status"], lines)
 
 
-def _value(row: Row | None) -> str:
+def _value(row: CalibrationRow | None) -> str:
     return "–" if row is None else f"{with_sd(row['value'], row['sd'])} {row['unit']}"
 
 
-def print_refusals(console: Console, runs: Rows) -> None:
+def print_refusals(console: Console, runs: Sequence[UnfoldedRun]) -> None:
     """Stages that refused or failed: their sentence, and the numbers behind it. What follows from them is one line."""
     stopped = [run for run in runs if run["status"] in (Status.REFUSED, Status.FAILED) and run["stage"] != "ingest"]
     follow = [run["stage"] for run in stopped if is_consequence(run)]
     told: set[str] = set()
     for run in stopped:
-        reason = run["measured"].get("reason") or run["reason_code"]
+        reason = str(run["measured"].get("reason") or run["reason_code"])
         if run["stage"] in follow or reason in told:
             continue
         told.add(reason)
@@ -74,7 +78,7 @@ def print_refusals(console: Console, runs: Rows) -> None:
         console.print(f"not run for want of their input: {', '.join(follow)}", markup=False)
 
 
-def fit_table(rows: Rows) -> Any:
+def fit_table(rows: Sequence[FitRow]) -> Table:
     """The Theil inequality coefficients, raw and smoothed side by side, with degrees and rad/s."""
     by_place = {(r["quantity"], r["method"], r["reference"], r["sample"], r["signal"]): r for r in rows}
     order = {name: i for i, name in enumerate(QUANTITIES)}
@@ -87,5 +91,5 @@ def fit_table(rows: Rows) -> Any:
     return table(["quantity", "method", "against", "TIC raw", "rms raw", "TIC smoothed", "rms smoothed"], lines)
 
 
-def _fit(row: Row | None) -> tuple[str, str]:
+def _fit(row: FitRow | None) -> tuple[str, str]:
     return ("–", "–") if row is None else (number(row["tic"], 4), f"{number(row['rms'], 3)} {row['rms_unit']}")

@@ -6,7 +6,8 @@ import csv
 import json
 import sys
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from datetime import date, time
+from typing import TYPE_CHECKING
 
 from fieldcal.words.numbers import cell
 from fieldcal.words.rows import rows_of
@@ -21,7 +22,7 @@ PLAIN_WIDTH = 160
 FRAME_WIDTH = 1000
 
 
-def print_json(document: Any) -> None:
+def print_json(document: object) -> None:
     """One JSON document on stdout."""
     print(json.dumps(document, ensure_ascii=False, indent=1, allow_nan=False, default=_as_json))
 
@@ -72,11 +73,11 @@ def _numeric(text: str) -> bool:
     return text == "–" or text[:1].isdigit() or (text[:1] == "-" and text[1:2].isdigit())
 
 
-def _as_json(value: Any) -> Any:
-    return value.isoformat() if hasattr(value, "isoformat") else str(value)
+def _as_json(value: object) -> str:
+    return value.isoformat() if isinstance(value, date | time) else str(value)
 
 
-def _as_csv(value: Any) -> Any:
+def _as_csv(value: object) -> object:
     if isinstance(value, list | dict):
         return json.dumps(value, ensure_ascii=False, default=_as_json)
-    return value.isoformat() if hasattr(value, "isoformat") else value
+    return value.isoformat() if isinstance(value, date | time) else value

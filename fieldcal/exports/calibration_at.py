@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Literal, TypedDict
 
 import numpy as np
 import polars as pl
@@ -15,6 +16,7 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.stages.tables import AXES
 from fieldcal.warehouse.questions import existing
+from fieldcal.words.rows import typed
 
 _QUESTION = """
 SELECT a.*, l.slope_per_degc, l.curve_per_degc2, l.curve_per_degc3, l.temperature_min_degc, l.temperature_max_degc
@@ -22,6 +24,29 @@ FROM calibration_at(?) AS a
 JOIN latest_calibration AS l USING (imu_id, sensor, parameter, axis)
 WHERE a.vehicle_id = ? AND a.parameter IN ('scale', 'zero')
 """
+
+
+class _Axis(TypedDict):
+    """A row of the answer: one parameter and axis."""
+
+    imu_id: str
+    parameter: str
+    axis: str
+    value: float
+    sd: float | None
+    unit: str
+    flight_id: str
+    started_at: datetime | None
+    why: str
+    slope_per_degc: float | None
+    curve_per_degc2: float | None
+    curve_per_degc3: float | None
+    temperature_min_degc: float
+    temperature_max_degc: float
+
+
+_Number = Literal["value", "sd", "slope_per_degc", "curve_per_degc2", "curve_per_degc3"]
+_CURVE: tuple[_Number, ...] = ("slope_per_degc", "curve_per_degc2", "curve_per_degc3")
 
 
 def constants_of(root: Path, vehicle_id: str, temperature_degc: float | None = None) -> Constants:
@@ -59,7 +84,7 @@ def constants_of(root: Path, vehicle_id: str, temperature_degc: float | None = N
 
 def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
     """One sensor's constants; None unless every axis has both scale and zero."""
-    found = {(row["parameter"], row["axis"]): row for row in rows.iter_rows(named=True)}
+    found = {(row["parameter"], row["axis"]): row for row in typed(rows.iter_rows(named=True), _Axis)}
     if any((parameter, axis) not in found for parameter in ("scale", "zero") for axis in AXES):
         return None
     full = all(
@@ -69,15 +94,15 @@ def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
     )
     names = [[a + b if full else a if a == b else "" for b in AXES] for a in AXES]
 
-    def matrix(column: str) -> np.ndarray:
+    def matrix(column: _Number) -> np.ndarray:
         return np.array([[_or_zero(found[("scale", n)][column]) if n else 0.0 for n in row] for row in names])
 
-    def vector(parameter: str, column: str, unknown: float = 0.0) -> np.ndarray:
+    def vector(parameter: str, column: _Number, unknown: float = 0.0) -> np.ndarray:
         values = [found[parameter, axis][column] for axis in AXES]
         return np.array([unknown if v is None else v for v in values], dtype=float)
 
     # The curve about 25 °C, brought to the temperature that is asked for.
-    first, second, third = (vector("zero", c) for c in ("slope_per_degc", "curve_per_degc2", "curve_per_degc3"))
+    first, second, third = (vector("zero", c) for c in _CURVE)
     slope, square, cube = cubic_about(first, second, third, at - REFERENCE_DEGC)
     sloped = [row for row in found.values() if row["slope_per_degc"] is not None]
     flown = (
@@ -104,7 +129,7 @@ def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
     )
 
 
-def _calibrated_unit(found: dict[tuple[str, str], dict[str, Any]]) -> str:
+def _calibrated_unit(found: dict[tuple[str, str], _Axis]) -> str:
     """Unit of the result: a scale's unit is it per logged unit, or "1" where both are the same."""
     scale, logged = str(found["scale", "x"]["unit"]), str(found["zero", "x"]["unit"])
     divisor = f"/({logged})" if "/" in logged else f"/{logged}"

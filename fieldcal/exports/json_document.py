@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 
 from fieldcal.exports.calibration import Constants, Export, Triad
-from fieldcal.names import INERTIAL_FIRST
+from fieldcal.names import INERTIAL_FIRST, Json
 
 MODEL = (
     "calibrated = S (raw - Z), d = T - temperature_degc; S = scale + scale_per_degc d, Z = zero + zero_per_degc d"
@@ -28,7 +28,7 @@ def json_document(constants: Constants) -> Export:
     return Export(json.dumps(document, ensure_ascii=False, indent=1, allow_nan=False) + "\n", ())
 
 
-def _triad(triad: Triad) -> dict[str, Any]:
+def _triad(triad: Triad) -> Mapping[str, Json]:
     slopes = ("scale_per_degc", "zero_per_degc", "zero_per_degc2", "zero_per_degc3")
     arrays = ("scale", "zero", *slopes, "scale_sd", "zero_sd")
     return {
@@ -41,7 +41,7 @@ def _triad(triad: Triad) -> dict[str, Any]:
     }
 
 
-def _finite(array: np.ndarray) -> Any:
+def _finite(array: np.ndarray) -> Json:
     """Nested lists; an unknown sd is null."""
     if array.ndim > 1:
         return [_finite(row) for row in array]

@@ -21,10 +21,11 @@ from fieldcal.logs import flight_id, ingest, log_format, log_sha256
 from fieldcal.logs.facts import Facts
 from fieldcal.names import SENSORS, Approach, Json, Status, Verdict
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas.rows import CalibrationRow, FitRow, FlightDocument, SyncRow, UnfoldedFlight, UnfoldedRun
 from fieldcal.stages.pipeline import INGEST, PIPELINE
 from fieldcal.stages.results import StageResult, plain
 from fieldcal.stages.stage import run_stage
-from fieldcal.words.rows import rows_of, unfolded
+from fieldcal.words.rows import rows_of, typed, unfolded
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class CalibratedLog:
     """One log's results: `document` as `calibrate_log` returns it, every `stage.table`, and the flight's settings, None
     of a log that is not usable."""
 
-    document: dict[str, Any]
+    document: FlightDocument
     tables: dict[str, pl.DataFrame]
     settings: FlightSettings | None
 
@@ -48,7 +49,7 @@ class LogRead:
     facts: Facts
 
 
-def calibrate_log(log: Path, config: Path | None = None, **choices: Any) -> dict[str, Any]:
+def calibrate_log(log: Path, config: Path | None = None, **choices: Any) -> FlightDocument:
     """Calibrate one log; its flight, calibration, fit, sync and run, named as the columns of those tables. Arguments
     and errors as in `run_log`."""
     return run_log(log, config, **choices).document
@@ -136,13 +137,15 @@ def run_stages(log: LogRead) -> CalibratedLog:
     facts = judged(facts, records)
     leading = lead(job, vehicle.imu_id, facts)
     published = published_tables([(leading, {name: (frame, None) for name, frame in tables.items()})])
-    sync = rows_of(published["sync"])
-    document = {
-        "flight": unfolded(rows_of(rows_frame("flight", [flight_row(job, leading, facts)]))[0]),
-        "calibration": rows_of(published["calibration"]),
-        "fit": rows_of(published["fit"]),
+    sync = typed(rows_of(published["sync"]), SyncRow)
+    flight = rows_frame("flight", [flight_row(job, leading, facts)])
+    runs = rows_frame("run", run_rows(leading, records))
+    document: FlightDocument = {
+        "flight": typed(map(unfolded, rows_of(flight)), UnfoldedFlight)[0],
+        "calibration": typed(rows_of(published["calibration"]), CalibrationRow),
+        "fit": typed(rows_of(published["fit"]), FitRow),
         "sync": sync[0] if sync else None,
-        "run": [unfolded(row) for row in rows_of(rows_frame("run", run_rows(leading, records)))],
+        "run": typed(map(unfolded, rows_of(runs)), UnfoldedRun),
     }
     return CalibratedLog(document, tables, settings)
 

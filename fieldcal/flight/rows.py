@@ -130,7 +130,7 @@ def published_tables(flights: Sequence[tuple[Mapping[str, Any], StageTables]]) -
     return result
 
 
-def rows_frame(table: str, rows: list[dict[str, Any]]) -> pl.DataFrame:
+def rows_frame(table: str, rows: Sequence[Mapping[str, object]]) -> pl.DataFrame:
     """Rows as a typed frame of `table`."""
     empty = frame(schemas.arrow_schema(table).empty_table())
     return pl.DataFrame(rows, schema=empty.schema, strict=False) if rows else empty

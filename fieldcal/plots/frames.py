@@ -12,6 +12,8 @@ from fieldcal.plots.panels import COLOURS, REFUSED, legend, listed, panels, unit
 from fieldcal.report.trend import predicted
 from fieldcal.report.words import plain_name, preferred
 from fieldcal.schemas.reference import REFERENCE_DEGC
+from fieldcal.schemas.rows import DriftRow
+from fieldcal.words.rows import typed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -73,7 +75,9 @@ def plot_drift(rows: pl.DataFrame, title: str) -> list[Axes]:
     shown = rows["imu_id"].unique(maintain_order=True).to_list()[:MOST_CURVES]
     for (in_time, warm), name in zip(axes, names, strict=True):
         for colour, imu in zip(COLOURS, shown, strict=False):
-            for row in rows.filter(pl.col("axis") == name, pl.col("imu_id") == imu).iter_rows(named=True):
+            for row in typed(
+                rows.filter(pl.col("axis") == name, pl.col("imu_id") == imu).iter_rows(named=True), DriftRow
+            ):
                 if row["value_at_25degc"] is None:
                     continue
                 _trend_in_time(in_time, row, colour, f"{imu}: {row['status']}")
@@ -168,31 +172,33 @@ def _chosen(frame: pl.DataFrame, sensor: str | None, parameter: str | None) -> t
     return own, f"{sensor}: {parameter}, {plain_name(method)}"
 
 
-def _trend_in_time(axis: Axes, row: dict[str, Any], colour: str, label: str) -> None:
+def _trend_in_time(axis: Axes, row: DriftRow, colour: str, label: str) -> None:
     """From the step, or as long before the mean flight as the last one is after it, to the last flight."""
-    as_of = row["as_of"]
+    as_of, level = row["as_of"], row["value_at_25degc"]
     if as_of is None:
         axis.plot([], [], color=colour, label=label)
-        axis.axhline(row["value_at_25degc"], color=colour)
+        if level is not None:
+            axis.axhline(level, color=colour)
         return
     span = YEAR_DAYS
     if row["best_known_at"] is not None:
         span = max(2.0 * (as_of - row["best_known_at"]).total_seconds() / 86400.0, 1.0)
     if row["change_at"] is not None:
         span = min(span, (as_of - row["change_at"]).total_seconds() / 86400.0)
-        axis.axvline(row["change_at"], color=colour, linestyle=":", linewidth=1.2)
+        step: Any = row["change_at"]  # a moment, which matplotlib takes and its types do not
+        axis.axvline(step, color=colour, linestyle=":", linewidth=1.2)
     days = np.linspace(-span, 0.0, 60)
     value, sd = predicted(row, REFERENCE_DEGC, days)
     x = np.array([as_of + timedelta(days=float(d)) for d in days])
     _band(axis, x, value, sd, colour, label)
 
 
-def _trend_over_temperature(axis: Axes, row: dict[str, Any], colour: str) -> None:
-    low, high = row["temperature_min_degc"], row["temperature_max_degc"]
-    if low is None or high is None:
+def _trend_over_temperature(axis: Axes, row: DriftRow, colour: str) -> None:
+    low, high, level = row["temperature_min_degc"], row["temperature_max_degc"], row["value_at_25degc"]
+    if low is None or high is None or level is None:
         return
     if low == high:
-        axis.errorbar([low], [row["value_at_25degc"]], [SIGMAS * (row["sd"] or 0.0)], fmt="o", capsize=3, color=colour)
+        axis.errorbar([low], [level], [SIGMAS * (row["sd"] or 0.0)], fmt="o", capsize=3, color=colour)
         return
     degc = np.linspace(low, high, 60)
     value, sd = predicted(row, degc, 0.0)

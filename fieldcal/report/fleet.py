@@ -5,23 +5,32 @@ from __future__ import annotations
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
+from typing import Literal
 
 import polars as pl
 
 from fieldcal.names import GRAVEST_FIRST, DriftStatus, Verdict
-from fieldcal.report.history import as_of_sentence, newest, usable_flights
+from fieldcal.report.history import UsableFlight, as_of_sentence, newest, usable_flights
 from fieldcal.report.key_parameter import key_parameters
 from fieldcal.report.links import Links, flight_name, vehicle_name
 from fieldcal.report.page import Column, Notice, Page, Part, Section, Table, Text, badge
 from fieldcal.report.trend import change_sentence, worst_status
 from fieldcal.report.words import age, day, plain_name, with_unit
+from fieldcal.schemas.rows import DriftRow, FitRow, FlightRow
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.questions import existing
 from fieldcal.words.numbers import number
-from fieldcal.words.rows import Row
+from fieldcal.words.rows import typed
 
 LOOKS = 200
 NOT_ANALYSED = "not analysed"
+SERIES: tuple[Literal["sensor", "method", "parameter", "axis", "unit"], ...] = (
+    "sensor",
+    "method",
+    "parameter",
+    "axis",
+    "unit",
+)
 
 _COLUMNS = (
     Column("vehicle"),
@@ -45,7 +54,7 @@ def fleet_page(root: Path, links: Links, as_of: datetime | None) -> Page:
     drift = warehouse.scan("drift").collect()
     usable = usable_flights(warehouse)
     vehicles = sorted(flights["vehicle_id"].unique().to_list())
-    last = {row["vehicle_id"]: row for row in usable.iter_rows(named=True)}
+    last = {row["vehicle_id"]: row for row in typed(usable.iter_rows(named=True), UsableFlight)}
     worst = _worst_tics(warehouse, last)
     trends = {str(key[0]): part for key, part in drift.partition_by("imu_id", as_dict=True).items()}
     sparks = key_parameters(warehouse, trends)
@@ -94,13 +103,13 @@ def _row(
     vehicle: str,
     flights: pl.DataFrame,
     status: str | None,
-    last: Row | None,
-    tic: Row | None,
+    last: UsableFlight | None,
+    tic: FitRow | None,
     spark: tuple[str, str] | None,
     links: Links,
     as_of: datetime | None,
 ) -> list[str]:
-    latest = flights.row(-1, named=True)
+    latest = typed([flights.row(-1, named=True)], FlightRow)[0]
     text, drawn = spark or ("–", "")
     return [
         links.to(vehicle_name(vehicle), vehicle),
@@ -118,11 +127,11 @@ def _row(
     ]
 
 
-def _quantity(fit: Row) -> str:
+def _quantity(fit: FitRow) -> str:
     return f"{plain_name(fit['quantity'])} against {plain_name(fit['reference'])}"
 
 
-def _worst_tics(warehouse: Warehouse, last: Mapping[str, Row]) -> dict[str, Row]:
+def _worst_tics(warehouse: Warehouse, last: Mapping[str, UsableFlight]) -> dict[str, FitRow]:
     wanted = [row["flight_id"] for row in last.values()]
     rows = (
         warehouse.scan("fit")
@@ -130,36 +139,35 @@ def _worst_tics(warehouse: Warehouse, last: Mapping[str, Row]) -> dict[str, Row]
         .sort("tic", "quantity", "method", "reference")
         .collect()
     )
-    return {row["vehicle_id"]: row for row in rows.iter_rows(named=True)}
+    return {row["vehicle_id"]: row for row in typed(rows.iter_rows(named=True), FitRow)}
 
 
-def _siblings(drift: pl.DataFrame, row: Row) -> list[float]:
+def _siblings(drift: pl.DataFrame, row: DriftRow) -> list[float]:
     """Values at 25 °C of the same parameter of the fleet's other IMUs."""
-    same = (pl.col(name) == row[name] for name in ("sensor", "method", "parameter", "axis", "unit"))
+    same = (pl.col(name) == row[name] for name in SERIES)
     others = drift.filter(*same, pl.col("imu_id") != row["imu_id"], pl.col("value_at_25degc").is_not_null())
     return others["value_at_25degc"].to_list()
 
 
-def _unsteady(drift: pl.DataFrame) -> list[Row]:
+def _unsteady(drift: pl.DataFrame) -> list[DriftRow]:
     """Rows that need a look. `bias` and `zero` follow from `zero_bias`: where that says the same they are left out."""
     found = [
         row
-        for row in drift.iter_rows(named=True)
+        for row in typed(drift.iter_rows(named=True), DriftRow)
         if row["status"] not in (DriftStatus.STABLE, DriftStatus.INSUFFICIENT)
     ]
-    place = ("imu_id", "sensor", "method", "axis", "status")
-    told = {tuple(row[name] for name in place) for row in found if row["parameter"] == "zero_bias"}
-    return [
-        row
-        for row in found
-        if row["parameter"] not in ("bias", "zero") or tuple(row[name] for name in place) not in told
-    ]
+    told = {_place(row) for row in found if row["parameter"] == "zero_bias"}
+    return [row for row in found if row["parameter"] not in ("bias", "zero") or _place(row) not in told]
+
+
+def _place(row: DriftRow) -> tuple[str, ...]:
+    return row["imu_id"], row["sensor"], row["method"], row["axis"], row["status"]
 
 
 def _looks(drift: pl.DataFrame, links: Links) -> list[Part]:
     if drift.is_empty():
         return [Notice("The table drift is empty: no trends have been computed yet. Status columns say so.")]
-    order = {status: i for i, status in enumerate(GRAVEST_FIRST)}
+    order = {str(status): i for i, status in enumerate(GRAVEST_FIRST)}
     found = sorted(
         _unsteady(drift),
         key=lambda row: (

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from datetime import datetime
 
 import polars as pl
 
-from fieldcal.names import PREFERRED_METHODS, Status
+from fieldcal.names import PREFERRED_METHODS, Json, Status
 from fieldcal.report import flight_figures as draw
 from fieldcal.report.flight_curves import Curves, curves
 from fieldcal.report.flight_data import FlightData
@@ -15,10 +15,11 @@ from fieldcal.report.flight_quality import spectra, trust
 from fieldcal.report.links import Links, vehicle_name
 from fieldcal.report.page import Column, Folded, Notice, Page, Part, Section, Table, Text, badge
 from fieldcal.report.words import count, day, exactness, plain_name, scientific, unit, with_unit
+from fieldcal.schemas.rows import CalibrationRow, FitRow, UnfoldedFlight, UnfoldedRun
 from fieldcal.stages.warm_up import METHOD as WARM_UP
 from fieldcal.words.flights import QUANTITIES, advised, is_consequence, sync_sentence
 from fieldcal.words.numbers import cell, number
-from fieldcal.words.rows import Row
+from fieldcal.words.rows import typed
 
 PAPER_TIC = {
     ("attitude", "quest", "vps"): 0.0352,
@@ -80,7 +81,7 @@ def _refusals(data: FlightData) -> list[Part]:
     findings = [f for f in flight["findings"] or [] if f["sentence"] != flight["reason"]]
     parts += [Text(str(finding["sentence"])) for finding in findings]
     stopped = [row for row in data.run if row["status"] in (Status.REFUSED, Status.FAILED) and row["stage"] != "ingest"]
-    told: dict[str, list[Row]] = {}
+    told: dict[str, list[UnfoldedRun]] = {}
     for row in stopped:
         if not is_consequence(row):
             told.setdefault(str(row["measured"].get("reason") or row["reason_code"]), []).append(row)
@@ -109,7 +110,7 @@ def _constants(calibration: pl.DataFrame) -> list[Part]:
             "z = λ · logged + b, axis by axis in sensor axes as logged, polarity in λ's sign; ± one standard deviation."
         )
     ]
-    rows = [dict(row) for row in calibration.iter_rows(named=True)]
+    rows = typed(calibration.iter_rows(named=True), CalibrationRow)
     for sensor, name, letter in PAPER_TABLES:
         own = [row for row in rows if row["sensor"] == sensor and row["method"] != WARM_UP]
         printed = [row for row in own if row["parameter"] in PRINTED]
@@ -128,7 +129,7 @@ def _constants(calibration: pl.DataFrame) -> list[Part]:
     return parts
 
 
-def _paper_table(rows: Sequence[Row], caption: str, letter: str) -> Table:
+def _paper_table(rows: Sequence[CalibrationRow], caption: str, letter: str) -> Table:
     """Rows as the paper has them, a parameter and axis a line, a method a column, equation error first."""
     methods = sorted({r["method"] for r in rows}, key=lambda m: -exactness(m) if m in PREFERRED_METHODS else 0)
     by_place = {(r["parameter"], r["axis"], r["method"]): r for r in rows}
@@ -189,7 +190,7 @@ def _agreement(data: FlightData) -> list[Part]:
     ]
 
 
-def _fit_cells(row: Row | None) -> tuple[str, str]:
+def _fit_cells(row: FitRow | None) -> tuple[str, str]:
     if row is None or row["tic"] is None:
         return "–", "–"
     return (f"{row['tic']:.4f}", with_unit(number(row["rms"], 3), row["rms_unit"]))
@@ -236,7 +237,7 @@ def _figures(data: FlightData) -> list[Section]:
     return [*sections, Section("quality", "Residuals and gates", quality)] if quality else sections
 
 
-def _fits(c: Curves, fit: Sequence[Row]) -> list[Part]:
+def _fits(c: Curves, fit: Sequence[FitRow]) -> list[Part]:
     """Figures 7–10, each with its coefficient; a sentence where one cannot be."""
     told = {quantity: _coefficients(fit, quantity) for quantity in QUANTITIES}
     parts: list[Part] = [draw.attitude(c, told["attitude"] or "There is no VPS to compare with.")]
@@ -255,7 +256,7 @@ def _fits(c: Curves, fit: Sequence[Row]) -> list[Part]:
     return parts
 
 
-def _coefficients(fit: Sequence[Row], quantity: str) -> str:
+def _coefficients(fit: Sequence[FitRow], quantity: str) -> str:
     """Eq. 16 of a quantity in words, smoothed readings as the figures show them."""
     own = [r for r in fit if r["quantity"] == quantity and r["signal"] == "smoothed" and r["tic"] is not None]
     if not own:
@@ -313,12 +314,12 @@ def _stages(data: FlightData) -> list[Part]:
     return parts
 
 
-def _numbers(measured: Row | None) -> str:
+def _numbers(measured: Mapping[str, Json] | None) -> str:
     """What a stage measured, in a line."""
     return ", ".join(f"{k} = {_plain(v)}" for k, v in (measured or {}).items() if k != "reason")
 
 
-def _plain(value: Any) -> str:
+def _plain(value: Json) -> str:
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{k}: {_plain(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list | tuple):
@@ -326,16 +327,14 @@ def _plain(value: Any) -> str:
     return cell(value)
 
 
-def _temperature(flight: Row) -> str:
-    low, mean, high = (flight[f"temperature_{k}_degc"] for k in ("min", "mean", "max"))
+def _temperature(flight: UnfoldedFlight) -> str:
+    low, mean, high = flight["temperature_min_degc"], flight["temperature_mean_degc"], flight["temperature_max_degc"]
     return "not logged" if mean is None else f"{low:.1f} … {high:.1f} °C, mean {mean:.1f}"
 
 
-def _or_dash(value: Any, form: str) -> str:
+def _or_dash(value: float | None, form: str) -> str:
     return "–" if value is None else form.format(value)
 
 
-def _moment(value: Any) -> Any:
-    from datetime import datetime
-
+def _moment(value: datetime | str | None) -> datetime | None:
     return datetime.fromisoformat(value) if isinstance(value, str) else value

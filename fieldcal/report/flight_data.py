@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
@@ -13,14 +12,15 @@ from fieldcal.config.stage_settings import Axes, Differentiation, Gravity, Local
 from fieldcal.errors import FieldcalError
 from fieldcal.flight.calibrate import CalibratedLog
 from fieldcal.flight.rows import rows_frame
-from fieldcal.names import InitialAttitude, Status
+from fieldcal.names import InitialAttitude, Json, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import SIGNAL_TABLES, SchemaMismatch
+from fieldcal.schemas.rows import FitRow, SyncRow, UnfoldedFlight, UnfoldedRun
 from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.stage_store import StageStore, outputs_of
-from fieldcal.words.rows import Row, rows_of, unfolded
+from fieldcal.words.rows import rows_of, typed, unfolded
 
 STAGE_TABLES = ("manoeuvre.segments", "smoothing.samples", "attitude_pass2.attitude", "vps_sync.vps_aligned")
 
@@ -41,13 +41,13 @@ class FlightData:
     `gone` names stages whose tables should be there and are not.
     """
 
-    flight: Row
+    flight: UnfoldedFlight
     calibration: pl.DataFrame
-    fit: Sequence[Row]
-    sync: Row | None
-    run: Sequence[Row]
+    fit: Sequence[FitRow]
+    sync: SyncRow | None
+    run: Sequence[UnfoldedRun]
     tables: Mapping[str, pl.DataFrame]
-    parameters: Row
+    parameters: Mapping[str, Json]
     settings: FigureSettings | None
     gone: tuple[str, ...] = field(default=())
 
@@ -55,7 +55,8 @@ class FlightData:
     def units(self) -> Mapping[str, str]:
         """Unit of each sensor's logged readings."""
         ingest = next((row for row in self.run if row["stage"] == "ingest"), None)
-        return {} if ingest is None else (ingest["measured"] or {}).get("units") or {}
+        units = None if ingest is None else (ingest["measured"] or {}).get("units")
+        return {sensor: str(unit) for sensor, unit in units.items()} if isinstance(units, Mapping) else {}
 
 
 def read_flight(root: Path, flight_id: str) -> FlightData:
@@ -67,24 +68,23 @@ def read_flight(root: Path, flight_id: str) -> FlightData:
         `no_warehouse`; `not_found`: no flight, or more than one, has this id, this start of an id, or this `log_uri`.
     """
     warehouse = existing(root)
-    flight = unfolded(rows_of(_one_flight(warehouse, flight_id))[0])
+    flight = typed(map(unfolded, rows_of(_one_flight(warehouse, flight_id))), UnfoldedFlight)[0]
     ids = {"vehicle_id": flight["vehicle_id"], "flight_id": flight["flight_id"]}
     history = {name: warehouse.scan(name, **ids).collect() for name in ("calibration", "fit", "sync", "run")}
     order = {stage: i for i, stage in enumerate(("ingest", *(stage.name for stage in PIPELINE)))}
-    run = sorted(
-        (unfolded(row) for row in rows_of(history["run"])), key=lambda row: order.get(row["stage"], len(order))
-    )
+    run = typed(map(unfolded, rows_of(history["run"])), UnfoldedRun)
+    run.sort(key=lambda row: order.get(row["stage"], len(order)))
     tables: dict[str, pl.DataFrame] = {}
     for name in SIGNAL_TABLES:
         signal = _signal(warehouse, name, ids)
         if not signal.is_empty():
             tables[f"ingest.{name}"] = signal.drop("vehicle_id", "flight_id")
     stages, parameters, gone = _stages(root, flight["flight_id"], run)
-    sync = rows_of(history["sync"])
+    sync = typed(rows_of(history["sync"]), SyncRow)
     return FlightData(
         flight,
         history["calibration"],
-        rows_of(history["fit"]),
+        typed(rows_of(history["fit"]), FitRow),
         sync[0] if sync else None,
         run,
         tables | stages,
@@ -97,7 +97,7 @@ def read_flight(root: Path, flight_id: str) -> FlightData:
 def of_log(log: CalibratedLog) -> FlightData:
     """A flight calibrated in memory, without a warehouse."""
     document = log.document
-    parameters: dict[str, Any] = {}
+    parameters: dict[str, Json] = {}
     if log.settings is not None:
         for stage in PIPELINE:
             parameters |= as_json(taken_from(log.settings, stage.takes))
@@ -142,12 +142,12 @@ def _signal(warehouse: Warehouse, name: str, ids: Mapping[str, str]) -> pl.DataF
 
 
 def _stages(
-    root: Path, flight_id: str, run: Sequence[Row]
-) -> tuple[dict[str, pl.DataFrame], dict[str, Any], tuple[str, ...]]:
+    root: Path, flight_id: str, run: Sequence[UnfoldedRun]
+) -> tuple[dict[str, pl.DataFrame], dict[str, Json], tuple[str, ...]]:
     """Tables that are there, the parameters of their stages, and the stages that should be there and are not."""
     store = StageStore(root)
     tables: dict[str, pl.DataFrame] = {}
-    parameters: dict[str, Any] = {}
+    parameters: dict[str, Json] = {}
     gone = []
     for row in run:
         stage = row["stage"]
@@ -166,7 +166,7 @@ def _stages(
             if table not in outputs_of(record):
                 continue
             try:
-                tables[name] = store.load(stage, flight_id, row["run_key"], [table])[table]
+                tables[name] = store.load(stage, flight_id, str(row["run_key"]), [table])[table]
             except (WarehouseError, SchemaMismatch):
                 gone.append(stage)
     return tables, parameters, tuple(gone)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from itertools import chain
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -16,6 +17,9 @@ from fieldcal.report.page import Plot
 from fieldcal.report.plot import INK, XYZ, backdrop, curve, headed, legend, panels, solid_panels, svg, without_wraps
 from fieldcal.report.words import plain_name, unit
 from fieldcal.stages.tables import QUATERNION, matrix, seconds, triad
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 SPHERE_POINTS = 1500
 QUEST_HZ = 9.0
@@ -38,9 +42,9 @@ def unprocessed(tables: Mapping[str, pl.DataFrame], units: Mapping[str, str]) ->
     origin = _origin(tables)
     shown = [*signals, ("vps", "")] if aligned is not None or logged is not None else signals
     figure, axes = panels((len(shown) + 1) // 2, 2, height_in=2.45 * ((len(shown) + 1) // 2) + 0.3)
-    for axis in list(axes.flat)[len(shown) :]:
+    for axis in list(chain.from_iterable(axes))[len(shown) :]:
         axis.set_visible(False)
-    for axis, (name, table) in zip(axes.flat, signals, strict=False):
+    for axis, (name, table) in zip(chain.from_iterable(axes), signals, strict=False):
         frame = tables[f"ingest.{table}"]
         t, values = seconds(frame["t_ns"], origin), matrix(frame, triad(name))
         for i, colour in enumerate(XYZ):
@@ -49,10 +53,10 @@ def unprocessed(tables: Mapping[str, pl.DataFrame], units: Mapping[str, str]) ->
         legend(axis)
     orientation = ""
     if len(shown) > len(signals):
-        axis = axes.flat[len(signals)]
+        axis = list(chain.from_iterable(axes))[len(signals)]
         orientation = _orientation(axis, aligned, logged, origin)
         if signals and aligned is not None:
-            axis.set_xlim(axes.flat[0].get_xlim())
+            axis.set_xlim(axes[0][0].get_xlim())
     for axis in axes[-1]:
         axis.set_xlabel("time (s)")
     caption = f"Figure 5. Unprocessed readings.{orientation}"
@@ -61,7 +65,7 @@ def unprocessed(tables: Mapping[str, pl.DataFrame], units: Mapping[str, str]) ->
     )
 
 
-def _orientation(axis: Any, aligned: pl.DataFrame | None, logged: pl.DataFrame | None, origin: int) -> str:
+def _orientation(axis: Axes, aligned: pl.DataFrame | None, logged: pl.DataFrame | None, origin: int) -> str:
     """Euler angles of the synchronised VPS; else its quaternion as logged, on its own clock."""
     if aligned is not None and not aligned.is_empty():
         t, angles = seconds(aligned["t_ns"], origin), euler_angles(continuous(matrix(aligned, QUATERNION)))
@@ -202,15 +206,15 @@ def body_rates(c: Curves, told: str) -> Plot | None:
         return None
     figure, axes = panels(3, 1, height_in=5.4, sharex=True)
     for i in range(3):
-        axis = axes[i, 0]
+        axis = axes[i][0]
         if c.t_vps is not None and c.vps_rate is not None:
             backdrop(axis, c.t_vps, c.vps_rate[:, i], "VPS")
         for (method, rate), colour in zip(c.body_rate.items(), (INK["c3"], INK["c2"], INK["c4"]), strict=False):
             dashes = "-" if method != "output_error" else "--"
             curve(axis, c.t, rate[:, i], colour, label=plain_name(method), width=0.9, dashes=dashes)
         axis.set_ylabel(f"ω{'xyz'[i]} (rad/s)")
-    legend(axes[0, 0])
-    axes[2, 0].set_xlabel("time (s)")
+    legend(axes[0][0])
+    axes[2][0].set_xlabel("time (s)")
     missing = "" if c.t_vps is not None else " There is no VPS to compare with."
     caption = f"Figure 10. Body rates (FRD) from the calibrated, smoothed gyroscope and from the VPS.{missing} {told}"
     return Plot(
@@ -230,12 +234,12 @@ def _four(
 ) -> Plot:
     """Four quaternion components, two curves each."""
     figure, axes = panels(2, 2, height_in=4.6, sharex=True)
-    for i, (axis, name) in enumerate(zip(axes.flat, names, strict=True)):
+    for i, (axis, name) in enumerate(zip(chain.from_iterable(axes), names, strict=True)):
         if data is not None:
             backdrop(axis, data[0], data[1][:, i], data[2])
         curve(axis, model[0], model[1][:, i], INK["c2"], label=model[2], width=0.9)
         headed(axis, name)
-    legend(axes[0, 0])
+    legend(axes[0][0])
     for axis in axes[1]:
         axis.set_xlabel("time (s)")
     description = f"{title}: {' and '.join(part[2] for part in (data, model) if part is not None)} against time"

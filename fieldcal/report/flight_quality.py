@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 import numpy as np
 import polars as pl
 
@@ -55,15 +57,15 @@ def spectra(c: Curves, samples: pl.DataFrame, calibration: pl.DataFrame, setting
     if not shown:
         return None
     figure, axes = panels((len(shown) + 1) // 2, 2, height_in=2.5 * ((len(shown) + 1) // 2) + 0.3)
-    for axis in list(axes.flat)[len(shown) :]:
+    for axis in list(chain.from_iterable(axes))[len(shown) :]:
         axis.set_visible(False)
-    for axis, (title, per, lines) in zip(axes.flat, shown, strict=False):
+    for axis, (title, per, lines) in zip(chain.from_iterable(axes), shown, strict=False):
         for (name, spectrum), colour in zip(lines, (INK["c1"], INK["c2"], INK["c3"]), strict=False):
             assert spectrum is not None
             axis.loglog(*_by_octave_shares(*spectrum), color=colour, linewidth=1.0, label=name)
         headed(axis, f"{title} ({per})")
         legend(axis, 1, inside="lower left")
-    for axis in list(axes.flat)[max(0, len(shown) - 2) : len(shown)]:
+    for axis in list(chain.from_iterable(axes))[max(0, len(shown) - 2) : len(shown)]:
         axis.set_xlabel("frequency (Hz)")
     caption = (
         "Residual spectra: amplitude spectral density of each step's residual (Welch, longest stretch without a gap;"
@@ -94,19 +96,19 @@ def trust(attitude: pl.DataFrame, segments: pl.DataFrame | None, settings: Figur
             ("weight", "weight of the attitude, 0 to 1"),
         )
     ):
-        curve(axes[row, 0], t, attitude[column].to_numpy(), INK["c1"], width=0.8)
-        headed(axes[row, 0], title)
+        curve(axes[row][0], t, attitude[column].to_numpy(), INK["c1"], width=0.8)
+        headed(axes[row][0], title)
     gate = settings.gate_norm
     if gate is not None:
         for side in (-1, 1):
-            axes[0, 0].axhline(side * gate * settings.gravity_mps2, color=INK["warn"], linewidth=0.8, linestyle="--")
-    axes[2, 0].set_ylim(-0.05, 1.1)
+            axes[0][0].axhline(side * gate * settings.gravity_mps2, color=INK["warn"], linewidth=0.8, linestyle="--")
+    axes[2][0].set_ylim(-0.05, 1.1)
     if segments is not None:
         for start, end, used in segments.select("start_ns", "end_ns", "used").iter_rows():
             shade = INK["c3"] if used else INK["muted"]
-            for axis in axes[:, 0]:
+            for axis in chain.from_iterable(axes):
                 axis.axvspan((start - origin) * 1e-9, (end - origin) * 1e-9, color=shade, alpha=0.08, linewidth=0)
-    axes[2, 0].set_xlabel("time (s)")
+    axes[2][0].set_xlabel("time (s)")
     caption = "Gates. Smoothed readings; shaded: excited segments (green used, grey not)."
     if gate is not None:
         caption += f" Dashed: the accelerometer's gate, {100 * gate:.3g} % of gravity."

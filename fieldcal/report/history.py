@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from datetime import datetime
-from typing import Any
+from typing import TypedDict
 
 import polars as pl
 
@@ -12,7 +12,42 @@ from fieldcal.names import Status
 from fieldcal.report.words import day
 from fieldcal.stages.warm_up import METHOD as WARM_UP
 from fieldcal.warehouse import Warehouse
-from fieldcal.words.rows import Row
+
+
+class LatestCalibration(TypedDict):
+    """What the reports read of a row of the view `latest_calibration`."""
+
+    sensor: str
+    method: str
+    parameter: str
+    axis: str
+    value_at_25degc: float
+    sd: float | None
+    unit: str
+    temperature_degc: float | None
+    started_at: datetime | None
+    source: str
+    why: str
+
+
+class RefusedRow(TypedDict):
+    """What the reports read of a row of the view `refusals`. `detail` of a stage is JSON: what it measured."""
+
+    started_at: datetime | None
+    flight_id: str
+    level: str
+    what: str
+    status: str
+    reason_code: str | None
+    detail: str | None
+
+
+class UsableFlight(TypedDict):
+    """A row of `usable_flights`."""
+
+    vehicle_id: str
+    flight_id: str
+    started_at: datetime | None
 
 
 def newest(warehouse: Warehouse) -> datetime | None:
@@ -41,14 +76,9 @@ def as_of_sentence(as_of: datetime | None, given: bool) -> str:
     return f"Ages count to {day(as_of)} UTC, {what}."
 
 
-def unfold(text: Any) -> Any:
-    """A JSON text of the history (`findings`, `measured`, `versions`) as an object."""
-    return json.loads(text) if isinstance(text, str) else text
-
-
-def reason_of(row: Row) -> str:
+def reason_of(row: RefusedRow) -> str:
     """Why a row of the view `refusals` is there: its sentence, else its code."""
     detail = row["detail"]
     if row["level"] == "stage":
-        detail = (unfold(detail) or {}).get("reason")
+        detail = (json.loads(detail) if detail else {}).get("reason")
     return str(detail or row["reason_code"] or "")

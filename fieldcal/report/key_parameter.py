@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import polars as pl
 
 from fieldcal.names import GRAVEST_FIRST, INERTIAL_FIRST, DriftStatus, Status
 from fieldcal.report.plot import sparkline
 from fieldcal.report.words import PARAMETERS, count, preferred, scientific, unit, with_unit
+from fieldcal.schemas.rows import DriftRow
 from fieldcal.warehouse import Warehouse
-from fieldcal.words.rows import Row
+from fieldcal.words.rows import typed
 
 POINTS = 60
 PLACE = ("sensor", "method", "parameter", "axis")
@@ -36,9 +36,9 @@ def key_parameters(warehouse: Warehouse, trends: Mapping[str, pl.DataFrame]) -> 
 
 
 def _drawn(own: pl.DataFrame, drift: pl.DataFrame | None) -> tuple[str, str]:
-    there: set[Any] = set(own.select(PLACE).unique().iter_rows())
+    there: set[Place] = set(own.select(PLACE).unique().iter_rows())
     unsteady = _least_steady(drift, there)
-    place = _gyroscope(there) if unsteady is None else tuple(unsteady[name] for name in PLACE)
+    place = _gyroscope(there) if unsteady is None else _place(unsteady)
     shown = own.filter(*(pl.col(name) == value for name, value in zip(PLACE, place, strict=True))).tail(POINTS)
     values = shown["value"].to_list()
     step = None if unsteady is None else unsteady["change_at"]
@@ -50,25 +50,28 @@ def _drawn(own: pl.DataFrame, drift: pl.DataFrame | None) -> tuple[str, str]:
     return f"{name}: {with_unit(scientific(values[-1]), own_unit)}", sparkline(values, marked, label)
 
 
-def _least_steady(drift: pl.DataFrame | None, there: set[Any]) -> dict[str, Any] | None:
+def _least_steady(drift: pl.DataFrame | None, there: set[Place]) -> DriftRow | None:
     """The row of the IMU's trends that is least steady and has a history to draw; None where all are steady."""
-    rows = [] if drift is None else list(drift.iter_rows(named=True))
+    rows = [] if drift is None else typed(drift.iter_rows(named=True), DriftRow)
     found = [
         row
         for row in rows
-        if row["status"] not in (DriftStatus.STABLE, DriftStatus.INSUFFICIENT)
-        and tuple(row[name] for name in PLACE) in there
+        if row["status"] not in (DriftStatus.STABLE, DriftStatus.INSUFFICIENT) and _place(row) in there
     ]
     return min(found, key=_steadiness, default=None)
 
 
-def _steadiness(row: Row) -> tuple[Any, ...]:
+def _steadiness(row: DriftRow) -> tuple[int, int, float, Place]:
     status = GRAVEST_FIRST.index(DriftStatus(row["status"])) if row["status"] in GRAVEST_FIRST else len(GRAVEST_FIRST)
     parameter = PARAMETERS.index(row["parameter"]) if row["parameter"] in PARAMETERS else len(PARAMETERS)
-    return status, parameter, -abs(row["last_z"] or 0.0), *(row[name] for name in PLACE)
+    return status, parameter, -abs(row["last_z"] or 0.0), _place(row)
 
 
-def _gyroscope(there: set[Any]) -> Place:
+def _place(row: DriftRow) -> Place:
+    return row["sensor"], row["method"], row["parameter"], row["axis"]
+
+
+def _gyroscope(there: set[Place]) -> Place:
     """Level of the gyroscope's first axis by its most exact method; of another sensor where there is none."""
     sensors = {place[0] for place in there}
     sensor = next(name for name in (*INERTIAL_FIRST, *sorted(sensors)) if name in sensors)

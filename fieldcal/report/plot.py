@@ -10,7 +10,8 @@ import io
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from itertools import chain
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from markupsafe import Markup, escape
@@ -20,6 +21,7 @@ from fieldcal.geometry.rotation import Array
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.typing import RcKeyType
 
 INK = {
     name: f"#fe01{number:02x}"
@@ -32,7 +34,7 @@ BUCKETS = 500
 """A curve keeps the least and the greatest of so many equal shares of its samples: no peak is lost."""
 
 _WIDTH_IN = 9.6
-_STYLE: Any = {
+_STYLE: dict[RcKeyType, object] = {
     "svg.fonttype": "none",
     "timezone": "UTC",
     "font.size": 9,
@@ -76,20 +78,25 @@ def page_style() -> Iterator[None]:
         yield
 
 
-def panels(rows: int, columns: int, *, height_in: float, **shared: Any) -> tuple[Figure, Any]:
-    """A figure of the page's width with (rows, columns) panels."""
+def panels(
+    rows: int, columns: int, *, height_in: float, sharex: bool | Literal["col"] = False
+) -> tuple[Figure, list[list[Axes]]]:
+    """A figure of the page's width with (rows, columns) panels, by row."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     figure = Figure(figsize=(_WIDTH_IN, height_in))
-    axes = figure.subplots(rows, columns, squeeze=False, **shared)
+    axes: list[list[Axes]] = figure.subplots(rows, columns, squeeze=False, sharex=sharex).tolist()
     left, right, bottom, top, between = 0.75, 0.15, 0.5, 0.35, 0.32
     panel_in = (height_in - bottom - top) / (rows + between * (rows - 1))
-    for axis in axes.flat:
+    for axis in chain.from_iterable(axes):
         # Places of titles and labels are told: matplotlib spends long seeking them, and told ones are in line.
         axis.set_title("", y=1.0)
         axis.xaxis.set_label_coords(0.5, -0.32 / panel_in)
         axis.yaxis.set_label_coords(-0.07 * columns, 0.5)
-        axis.yaxis.get_major_locator().set_params(nbins=5)
+        ticks = axis.yaxis.get_major_locator()
+        assert isinstance(ticks, MaxNLocator)
+        ticks.set_params(nbins=5)
         axis.yaxis.get_offset_text().set_x(-0.06 * columns)  # left of the title
     figure.subplots_adjust(
         left=left / _WIDTH_IN,
@@ -103,7 +110,7 @@ def panels(rows: int, columns: int, *, height_in: float, **shared: Any) -> tuple
 
 
 def solid_panels(columns: int, *, height_in: float) -> tuple[Figure, list[Any]]:
-    """A figure of the page's width with three-dimensional panels."""
+    """A figure of the page's width with three-dimensional panels, which matplotlib has no types of."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(_WIDTH_IN, height_in))
@@ -174,7 +181,7 @@ def headed(axis: Axes, text: str) -> None:
     axis.set_title(text, loc="left", fontsize=9, color=INK["fg"], parse_math=False)
 
 
-def legend(axis: Any, columns: int = 4, *, inside: str | None = None) -> None:
+def legend(axis: Axes, columns: int = 4, *, inside: Literal["lower left"] | None = None) -> None:
     """Name a panel's curves: above its right corner, where no curve is, or at a place `inside`."""
     axis.legend(
         loc=inside or "lower right",
@@ -193,8 +200,17 @@ def legend(axis: Any, columns: int = 4, *, inside: str | None = None) -> None:
 def legend_below(figure: Figure, axis: Axes) -> None:
     """Name the curves of an axis for all panels, below them."""
     handles, labels = axis.get_legend_handles_labels()
-    place: Any = {"loc": "lower center", "bbox_to_anchor": (0.5, 0.0), "ncols": len(labels)}
-    figure.legend(handles, labels, fontsize=8, frameon=False, labelcolor=INK["fg"], borderpad=0.1, **place)
+    figure.legend(
+        handles,
+        labels,
+        fontsize=8,
+        frameon=False,
+        labelcolor=INK["fg"],
+        borderpad=0.1,
+        loc="lower center",
+        bbox_to_anchor=(0.5, 0.0),
+        ncols=len(labels),
+    )
     figure.subplots_adjust(bottom=0.85 / figure.get_figheight())
 
 

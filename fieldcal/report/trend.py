@@ -10,9 +10,10 @@ import polars as pl
 
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import GRAVEST_FIRST, DriftStatus
+from fieldcal.report.history import LatestCalibration
 from fieldcal.report.words import count, day, scientific, with_unit
 from fieldcal.schemas.reference import REFERENCE_DEGC
-from fieldcal.words.rows import Row
+from fieldcal.schemas.rows import DriftRow
 
 """Worst first; `insufficient` says nothing, so a vehicle has it only where nothing else is known."""
 
@@ -27,7 +28,7 @@ def worst_status(drift: pl.DataFrame | None) -> str | None:
     return next((status for status in GRAVEST_FIRST if status in there), min(map(str, there)))
 
 
-def change_sentence(row: Row, siblings: Sequence[float]) -> str:
+def change_sentence(row: DriftRow, siblings: Sequence[float]) -> str:
     """What is not steady about a drift row: its own sentence, and what the siblings show of an outlier."""
     told = str(row["reason"] or "")
     if row["status"] == DriftStatus.OUTLIER and siblings:
@@ -41,14 +42,14 @@ def change_sentence(row: Row, siblings: Sequence[float]) -> str:
     return "–" if slope == "–" else f"{with_unit(slope, row['unit'])} per day."
 
 
-def warmed(row: Row, degc: Array | float) -> Array:
+def warmed(row: DriftRow, degc: Array | float) -> Array:
     """What a drift row's regression adds to the value at 25 °C at another temperature."""
     d = np.asarray(degc, dtype=float) - REFERENCE_DEGC
-    first, second, third = (row[c] or 0.0 for c in ("slope_per_degc", "curve_per_degc2", "curve_per_degc3"))
+    first, second, third = (r or 0.0 for r in (row["slope_per_degc"], row["curve_per_degc2"], row["curve_per_degc3"]))
     return np.asarray(first * d + second * d**2 + third * d**3)
 
 
-def predicted(row: Row, degc: Array | float, days: Array | float) -> tuple[Array, Array]:
+def predicted(row: DriftRow, degc: Array | float, days: Array | float) -> tuple[Array, Array]:
     """Value and standard deviation of a drift row's regression at a temperature, so many days after its moment.
 
     The value at 25 °C and the slope on temperature are correlated; they are independent at `best_known_degc`, B:
@@ -57,21 +58,23 @@ def predicted(row: Row, degc: Array | float, days: Array | float) -> tuple[Array
     once, the covariance of the two slopes is missing: ask along one of them.
     """
     degc, later = np.asarray(degc, dtype=float), np.asarray(days, dtype=float)
-    slope_sd = row["slope_per_degc_sd"] or 0.0
+    level, slope_sd = row["value_at_25degc"], row["slope_per_degc_sd"] or 0.0
+    assert level is not None, "a drift row without a value predicts nothing"
     best = REFERENCE_DEGC if row["best_known_degc"] is None else row["best_known_degc"]
-    value = row["value_at_25degc"] + warmed(row, degc) + (row["slope_per_day"] or 0.0) * later
+    value = level + warmed(row, degc) + (row["slope_per_day"] or 0.0) * later
     at_temperature = (row["sd"] or 0.0) ** 2 + slope_sd**2 * ((degc - best) ** 2 - (REFERENCE_DEGC - best) ** 2)
-    best_day = 0.0 if row["best_known_at"] is None else days_after([row["best_known_at"]], row["as_of"])[0]
+    best_at, as_of = row["best_known_at"], row["as_of"]
+    best_day = 0.0 if best_at is None or as_of is None else days_after([best_at], as_of)[0]
     in_time = (row["slope_per_day_sd"] or 0.0) ** 2 * ((later - best_day) ** 2 - best_day**2)
     return np.asarray(value), np.sqrt(np.maximum(at_temperature + in_time, 0.0))
 
 
-def days_after(moments: list[datetime | None], reference: datetime) -> Array:
+def days_after(moments: Sequence[datetime | None], reference: datetime) -> Array:
     """Days from `reference`, (n,); NaN where the time is unknown."""
     return np.array([np.nan if m is None else (m - reference).total_seconds() / DAY_S for m in moments])
 
 
-def fly_with_sentence(row: Row) -> str:
+def fly_with_sentence(row: LatestCalibration) -> str:
     """Where a constant to fly with comes from: a row of `latest_calibration`."""
     if row["source"] != "flight":
         return str(row["why"])

@@ -11,19 +11,20 @@ import polars as pl
 from fieldcal.errors import FieldcalError
 from fieldcal.names import GRAVEST_FIRST, SENSORS, DriftStatus, Status
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.report.history import as_of_sentence, newest, reason_of, unfold, usable_flights
+from fieldcal.report.history import LatestCalibration, RefusedRow, as_of_sentence, newest, reason_of, usable_flights
 from fieldcal.report.links import Links, flight_name
 from fieldcal.report.page import Column, Folded, Heading, Notice, Page, Part, Section, Simple, Table, Text, badge
 from fieldcal.report.trend import change_sentence, fly_with_sentence, worst_status
 from fieldcal.report.vehicle_figures import MOST_POINTS, agreement_plot, lag_plot, parameter_plot
 from fieldcal.report.words import PARAMETERS, age, count, day, plain_name, preferred, scientific, unit
 from fieldcal.schemas.reference import REFERENCE_DEGC
+from fieldcal.schemas.rows import DriftRow, UnfoldedFlight
 from fieldcal.stages.warm_up import METHOD as WARM_UP
 from fieldcal.stages.warm_up import PARAMETER as WARM_UP_SLOPE
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.questions import existing
 from fieldcal.words.numbers import number
-from fieldcal.words.rows import Row
+from fieldcal.words.rows import typed, unfolded
 
 FLIGHTS, REFUSALS, FEWEST_POINTS = 200, 100, 30
 OPEN = ("scale", "zero_bias", WARM_UP_SLOPE)
@@ -86,8 +87,8 @@ def _fly_with(warehouse: Warehouse, imu_id: str) -> list[Part]:
     if rows.is_empty():
         return [Notice("No flight gave a constant: there is nothing to fly with.")]
     axes = sorted(rows["axis"].unique().to_list())
-    by_place: dict[tuple[str, str], dict[str, Row]] = {}
-    for r in rows.iter_rows(named=True):
+    by_place: dict[tuple[str, str], dict[str, LatestCalibration]] = {}
+    for r in typed(rows.iter_rows(named=True), LatestCalibration):
         by_place.setdefault((r["sensor"], r["parameter"]), {})[r["axis"]] = r
     lines = []
     for sensor, parameter in sorted(by_place, key=lambda p: (_place(SENSORS, p[0]), _place(PARAMETERS, p[1]), p)):
@@ -113,7 +114,7 @@ def _fly_with(warehouse: Warehouse, imu_id: str) -> list[Part]:
     ]
 
 
-def _sources(by_axis: Mapping[str, Row]) -> str:
+def _sources(by_axis: Mapping[str, LatestCalibration]) -> str:
     """Where the constants of a parameter come from, axes of one source together."""
     axes: dict[str, list[str]] = {}
     for axis in sorted(by_axis):
@@ -131,12 +132,13 @@ def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
             )
         ]
     parts: list[Part] = []
+    rows = typed(drift.iter_rows(named=True), DriftRow)
     if set(drift["status"].to_list()) == {DriftStatus.INSUFFICIENT}:
         told = f"Too few flights for a trend ({count(usable, 'usable flight')}): every status is insufficient."
-        why = {str(r["reason"]) for r in drift.iter_rows(named=True) if r["reason"]}
+        why = {str(r["reason"]) for r in rows if r["reason"]}
         parts.append(Notice(" ".join([told, *sorted(why)])))
     ordered = sorted(
-        drift.iter_rows(named=True),
+        rows,
         key=lambda r: (
             _place(SENSORS, r["sensor"]),
             r["sensor"],
@@ -166,11 +168,11 @@ def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
     return [*parts, Folded(f"All {len(ordered)} regressions: {', '.join(counts)}", [every])]
 
 
-def _name(row: Row) -> str:
+def _name(row: DriftRow) -> str:
     return f"{plain_name(row['sensor'])} {row['parameter']} ({plain_name(row['method'])})"
 
 
-def _trend_table(caption: str, rows: Sequence[Row]) -> Table:
+def _trend_table(caption: str, rows: Sequence[DriftRow]) -> Table:
     columns = (
         Column("parameter"),
         Column("axis"),
@@ -240,7 +242,8 @@ def _method(rows: pl.DataFrame, drift: pl.DataFrame, method: str, vehicle_id: st
     for parameter in there:
         own = rows.filter(pl.col("parameter") == parameter)
         trend = drift.filter(pl.col("method") == method, pl.col("parameter") == parameter)
-        by_axis = {r["axis"]: r for r in trend.iter_rows(named=True) if r["status"] != DriftStatus.INSUFFICIENT}
+        of_axes = typed(trend.iter_rows(named=True), DriftRow)
+        by_axis = {r["axis"]: r for r in of_axes if r["status"] != DriftStatus.INSUFFICIENT}
         anchor = f"plot-{_slug(sensor, parameter, imu)}"
         plot = parameter_plot(own, by_axis, vehicle_id, f"{sensor} {parameter}", anchor, most)
         (parts if parameter in OPEN else folded).append(plot)
@@ -292,9 +295,9 @@ def _flights(flights: pl.DataFrame, usable: pl.DataFrame, links: Links) -> Table
             "–" if r["duration_s"] is None else f"{r['duration_s']:.1f}",
             "–" if r["temperature_mean_degc"] is None else f"{r['temperature_mean_degc']:.1f}",
             str(r["log_uri"]),
-            r["reason"] or "; ".join(str(f["sentence"]) for f in unfold(r["findings"]) or [])[:300],
+            r["reason"] or "; ".join(str(f["sentence"]) for f in r["findings"] or [])[:300],
         ]
-        for r in flights.reverse().head(FLIGHTS).iter_rows(named=True)
+        for r in typed(map(unfolded, flights.reverse().head(FLIGHTS).iter_rows(named=True)), UnfoldedFlight)
     ]
     more = (
         f"{flights.height - FLIGHTS} earlier flights are not shown: fieldcal history."
@@ -329,7 +332,7 @@ def _refusals(warehouse: Warehouse, vehicle_id: str, links: Links) -> list[Part]
             r["reason_code"] or "",
             reason_of(r),
         ]
-        for r in rows.head(REFUSALS).iter_rows(named=True)
+        for r in typed(rows.head(REFUSALS).iter_rows(named=True), RefusedRow)
     ]
     more = f'{rows.height - REFUSALS} more: fieldcal sql "SELECT * FROM refusals".' if rows.height > REFUSALS else ""
     return [Table(f"{count(rows.height, 'refusal')}, the latest first", columns, lines, more)]

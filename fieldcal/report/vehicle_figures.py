@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import datetime, timedelta
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from fieldcal.geometry.rotation import Array
@@ -16,7 +17,10 @@ from fieldcal.report.plot import INK, XYZ, headed, legend_below, panels, svg
 from fieldcal.report.trend import days_after, predicted, warmed
 from fieldcal.report.words import count, day, unit
 from fieldcal.schemas.reference import REFERENCE_DEGC
-from fieldcal.words.rows import Row
+from fieldcal.schemas.rows import DriftRow
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 MOST_POINTS = 250
 """Flights in a panel; fewer where a page has more panels."""
@@ -24,6 +28,9 @@ MOST_POINTS = 250
 SIGMAS = 2.0
 MARGIN = 0.15
 _ROW_IN = 1.35
+
+Across = Array | npt.NDArray[np.datetime64] | npt.NDArray[np.object_]
+"""Where points lie along an axis, (n,): numbers, or moments."""
 
 
 TOLD = {
@@ -41,7 +48,7 @@ TOLD = {
 
 
 def parameter_plot(
-    rows: pl.DataFrame, drift: Mapping[str, Row], vehicle_id: str, name: str, anchor: str, most: int
+    rows: pl.DataFrame, drift: Mapping[str, DriftRow], vehicle_id: str, name: str, anchor: str, most: int
 ) -> Plot:
     """One parameter of one triad, a row of panels an axis: against time, and (where logged) against temperature.
 
@@ -57,10 +64,10 @@ def parameter_plot(
         told |= _panel_row(row, own, drift.get(axis_name), vehicle_id)
         own_unit = unit(own["unit"][0])
         row[0].set_ylabel(f"{axis_name} ({own_unit})" if own_unit else axis_name, parse_math=False)
-    headed(axes[0, 0], f"{name} against time")
+    headed(axes[0][0], f"{name} against time")
     if warm:
-        headed(axes[0, 1], f"{name} against temperature")
-        axes[-1, 1].set_xlabel("temperature (°C)")
+        headed(axes[0][1], f"{name} against temperature")
+        axes[-1][1].set_xlabel("temperature (°C)")
     n = rows.filter(pl.col("axis") == names[0]).height
     shown = count(n, "flight") if n <= most else f"the latest {most} of {n} flights"
     sentences = [f"{name}: {shown}, error bars ±1σ.", *(sentence for key, sentence in TOLD.items() if key in told)]
@@ -68,7 +75,7 @@ def parameter_plot(
     return Plot(anchor, svg(figure, anchor, name, description), " ".join(sentences))
 
 
-def _panel_row(axes: Any, rows: pl.DataFrame, trend: Row | None, vehicle_id: str) -> set[str]:
+def _panel_row(axes: list[Axes], rows: pl.DataFrame, trend: DriftRow | None, vehicle_id: str) -> set[str]:
     """One axis; what its caption has to tell."""
     trend = None if trend is None or trend["value_at_25degc"] is None else trend
     told = {"plain" if trend is None else "trend"}
@@ -106,7 +113,8 @@ def _panel_row(axes: Any, rows: pl.DataFrame, trend: Row | None, vehicle_id: str
         warm = np.linspace(known.min(), known.max(), 60)
         _band(axes[1], warm, predicted(trend, warm, 0.0))
     if changed is not None and dated:
-        axes[0].axvline(changed, color=INK["warn"], linewidth=1.0, linestyle=(0, (4, 2)))
+        step: Any = changed  # a moment, which matplotlib takes and its types do not
+        axes[0].axvline(step, color=INK["warn"], linewidth=1.0, linestyle=(0, (4, 2)))
     if dated:
         _dates(axes[0])
     else:
@@ -114,7 +122,7 @@ def _panel_row(axes: Any, rows: pl.DataFrame, trend: Row | None, vehicle_id: str
     return told
 
 
-def _dates_at(days: Array, reference: datetime) -> np.ndarray:
+def _dates_at(days: Array, reference: datetime) -> npt.NDArray[np.object_]:
     """Moments so many days after the reference, for an axis."""
     return np.array([reference + timedelta(days=float(d)) for d in days])
 
@@ -131,8 +139,8 @@ def _limits(value: Array, sd: Array) -> tuple[float, float]:
 
 
 def _points(
-    axis: Any,
-    x: Array,
+    axis: Axes,
+    x: Across,
     y: Array,
     sd: Array,
     used: np.ndarray,
@@ -169,29 +177,29 @@ def _points(
     return told
 
 
-def _bars(axis: Any, x: Any, y: Array, sd: Array, colour: str) -> None:
+def _bars(axis: Axes, x: Across, y: Array, sd: Array, colour: str) -> None:
     """Error bars of (n,) points, as one line with gaps."""
     across = np.repeat(x, 3)
     along = np.column_stack([y - sd, y + sd, np.full(len(y), np.nan)]).ravel()
     axis.plot(across, along, color=colour, linewidth=0.7)
 
 
-def _band(axis: Any, x: Array, line: tuple[Array, Array]) -> None:
+def _band(axis: Axes, x: Across, line: tuple[Array, Array]) -> None:
     value, sd = line
     axis.fill_between(x, value - SIGMAS * sd, value + SIGMAS * sd, color=INK["c2"], alpha=0.18, linewidth=0)
     axis.plot(x, value, color=INK["c2"], linewidth=1.4)
 
 
-def _dates(axis: Any) -> None:
+def _dates(axis: Axes) -> None:
     from matplotlib import dates
 
-    ticks: Any = dates
+    ticks: Any = dates  # matplotlib has no types of this module
     locator = ticks.AutoDateLocator(minticks=3, maxticks=7)
     axis.xaxis.set_major_locator(locator)
     axis.xaxis.set_major_formatter(ticks.ConciseDateFormatter(locator))
 
 
-def _x_of(moments: list[datetime | None]) -> tuple[Any, bool]:
+def _x_of(moments: list[datetime | None]) -> tuple[Across, bool]:
     """Dates for an axis; the number of the flight where no date is known. Undated flights among dated ones are NaT."""
     if not any(moments):
         return np.arange(1.0, len(moments) + 1), False
@@ -226,20 +234,20 @@ def agreement_plot(fit: pl.DataFrame, anchor: str) -> Plot | None:
     for number, (own, label) in enumerate(curves):
         x, dated = _x_of(own["started_at"].to_list())
         colour = (*XYZ, INK["c4"], INK["fg"])[number]
-        style = {"color": colour, "marker": "osD^v"[number], "markersize": 3.5, "linewidth": 0.9, "label": label}
-        axes[0, 0].plot(x, own["tic"].to_numpy(), **style)
-        if own["rms_unit"][0] == "deg":
-            axes[0, 1].plot(x, own["rms"].to_numpy(), **style)
+        for axis, column in ((axes[0][0], "tic"), (axes[0][1], "rms")):
+            if column == "tic" or own["rms_unit"][0] == "deg":
+                y, marker = own[column].to_numpy(), "osD^v"[number]
+                axis.plot(x, y, color=colour, marker=marker, markersize=3.5, linewidth=0.9, label=label)
         for axis in axes[0]:
             if dated:
                 _dates(axis)
             else:
                 axis.set_xlabel("flight")
-    headed(axes[0, 0], "TIC (Eq. 16)")
-    headed(axes[0, 1], "rms attitude error (°)")
-    axes[0, 0].set_yscale("log")
-    axes[0, 1].set_ylim(bottom=0)
-    legend_below(figure, axes[0, 0])
+    headed(axes[0][0], "TIC (Eq. 16)")
+    headed(axes[0][1], "rms attitude error (°)")
+    axes[0][0].set_yscale("log")
+    axes[0][1].set_ylim(bottom=0)
+    legend_below(figure, axes[0][0])
     title = "Agreement over the flights"
     caption = (
         "Theil's coefficient flatters unit quaternions (TIC ≈ α/4 for an rms error α in rad), so degrees stand beside."
@@ -259,8 +267,8 @@ def lag_plot(sync: pl.DataFrame, anchor: str) -> Plot | None:
     figure, axes = panels(1, 2, height_in=2.6)
     x, dated = _x_of(good["started_at"].to_list())
     for axis, value, sd, factor, title in (
-        (axes[0, 0], "lag_mid_s", "lag_sd_s", 1e3, "lag at mid-flight (ms)"),
-        (axes[0, 1], "skew_ppm", "skew_sd_ppm", 1.0, "clock rate (ppm)"),
+        (axes[0][0], "lag_mid_s", "lag_sd_s", 1e3, "lag at mid-flight (ms)"),
+        (axes[0][1], "skew_ppm", "skew_sd_ppm", 1.0, "clock rate (ppm)"),
     ):
         y = factor * good[value].to_numpy()
         _bars(axis, x, y, factor * good[sd].fill_null(0.0).to_numpy(), INK["c1"])

@@ -7,7 +7,7 @@ import json
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 import polars as pl
@@ -204,10 +204,34 @@ def _seconds(name: str, t: np.ndarray) -> pl.Series:
     return pl.Series(name, np.rint(t * 1e9).astype(np.int64)).cast(pl.Decimal(18, 0)).cast(pl.Decimal(38, 9)) / 10**9
 
 
-def truth(r: Recording) -> dict[str, Any]:
+class TriadTruth(TypedDict):
+    """True constants of a triad at the mean temperature of the recording: x, y, z."""
+
+    scale: list[float]
+    bias: list[float]
+    zero: list[float]
+
+
+class Truth(TypedDict):
+    """What a calibration of a recording should find; `constants` by sensor, quaternions scalar last."""
+
+    temperature_degc: float
+    constants: dict[str, TriadTruth]
+    lag_s: float
+    skew_ppm: float
+    sensor_delay_s: float
+    vps_world_rotation_xyzw: list[float]
+    vps_body_rotation_xyzw: list[float]
+    lever_arm_m: list[float]
+    dip_rad: float
+    translation_rms_mps2: float
+    seed: int
+
+
+def truth(r: Recording) -> Truth:
     """What a calibration of this recording should find, plain JSON."""
     temperature = float(np.mean(r.temperature))
-    constants = {}
+    constants: dict[str, TriadTruth] = {}
     for name in SENSORS:
         scale, bias = constants_at(r.experiment, name, temperature)
         constants[name] = {"scale": scale.tolist(), "bias": bias.tolist(), "zero": (-bias / scale).tolist()}

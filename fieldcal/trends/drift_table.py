@@ -10,6 +10,7 @@ import polars as pl
 
 from fieldcal.names import GRAVEST_FIRST, Status
 from fieldcal.schemas import TABLES
+from fieldcal.schemas.rows import DriftRow
 from fieldcal.stages.run_key import run_key, source_digest
 from fieldcal.trends import few_sessions, regression, siblings
 from fieldcal.trends.curves import Bends, Bent, bends_of, bent
@@ -23,6 +24,7 @@ from fieldcal.warehouse.layout import history_files, vehicle_of
 from fieldcal.warehouse.publish import publish
 from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.store import empty_frame, read_table
+from fieldcal.words.rows import typed
 
 KEY = ["imu_id", "sensor", "method", "parameter", "axis"]
 ALIKE = ("sensor", "method", "parameter", "unit")
@@ -98,7 +100,8 @@ def table_of(flights: pl.DataFrame, bends: Bends = NO_BENDS, memory: Memory | No
         best_known_at=_moments(trends.best_day),
         status=pl.Series(regression.statuses(trends, fleet_p).tolist(), dtype=pl.String),
     )
-    told = result.with_columns(reason=pl.Series([reason(row) for row in result.iter_rows(named=True)], dtype=pl.String))
+    reasons = [reason(row) for row in typed(result.iter_rows(named=True), DriftRow)]
+    told = result.with_columns(reason=pl.Series(reasons, dtype=pl.String))
     return told.select(TABLES["drift"].column_names).sort(KEY)
 
 

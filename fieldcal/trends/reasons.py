@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from fieldcal.names import DriftStatus
 from fieldcal.schemas.reference import UNCONFIRMED_SD
+from fieldcal.schemas.rows import DriftRow
 from fieldcal.trends.series import ENOUGH_SESSIONS
 from fieldcal.words.numbers import number, with_sd
-from fieldcal.words.rows import Row
 
 VPS, AGREEMENT = "vps", "fit"
 """What stands as `sensor` of rows about the VPS clock and about agreement (Theil's coefficients)."""
 
 
-def reason(row: Row) -> str | None:
+def reason(row: DriftRow) -> str | None:
     """The sentence; None for a stable row whose last flight lies where it should."""
     unit = "" if row["unit"] in (None, "1") else f" {row['unit']}"
     if row["status"] == DriftStatus.INSUFFICIENT:
@@ -39,5 +39,5 @@ def reason(row: Row) -> str | None:
     return None
 
 
-def _sigmas(value: float, sd: float) -> str:
-    return f"{abs(value) / sd:.1f}" if sd else "many"
+def _sigmas(value: float | None, sd: float | None) -> str:
+    return f"{abs(value) / sd:.1f}" if value is not None and sd else "many"

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from fieldcal.names import Status, Verdict
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas.rows import Refusable, SyncRow, UnfoldedFlight, UnfoldedRun
 from fieldcal.words.numbers import number, with_sd
-from fieldcal.words.rows import Row
 
 QUANTITIES = {
     "attitude": "attitude",
@@ -15,10 +15,9 @@ QUANTITIES = {
     "attitude_propagated": "integrated attitude",
     "body_rate": "body rate",
 }
-Rows = Sequence[Row]
 
 
-def verdict_sentence(flight: Row) -> str:
+def verdict_sentence(flight: UnfoldedFlight) -> str:
     """What became of the log, in a line."""
     head = f"{flight['log_uri']} ({flight['vehicle_id']}, flight {flight['flight_id']}): {flight['verdict']}"
     if Verdict(flight["verdict"]).usable:
@@ -31,12 +30,13 @@ def verdict_sentence(flight: Row) -> str:
     return head + (f"\n  {flight['reason']}" if flight["reason"] else "")
 
 
-def advised(runs: Rows) -> list[str]:
+def advised(runs: Sequence[UnfoldedRun]) -> list[str]:
     """What would make weak constants better, by the stages that found them (a refused stage says it in its reason)."""
-    return [run["measured"]["advice"] for run in runs if run["status"] == Status.OK and run["measured"].get("advice")]
+    told = (run["measured"].get("advice") for run in runs if run["status"] == Status.OK)
+    return [str(advice) for advice in told if advice]
 
 
-def is_consequence(run: Row) -> bool:
+def is_consequence(run: Refusable) -> bool:
     """Whether a stage stopped only because another stage gave it nothing: `no_` and one of the tables that it needs.
 
     The same code is a cause where a stage finds it in the log itself: equation error's `no_gyroscope`."""
@@ -48,7 +48,7 @@ def is_consequence(run: Row) -> bool:
     return bool(run["status"] == Status.REFUSED and wanting)
 
 
-def sync_sentence(sync: Row) -> str:
+def sync_sentence(sync: SyncRow) -> str:
     """The clocks in a line."""
     if sync["status"] != Status.OK:
         return f"VPS clock: {sync['status']}; peak {number(sync['peak'], 3)}, next best {number(sync['runner_up'], 3)}"

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from datetime import datetime
 from math import floor, log10
-from typing import Any
 
 
-def cell(value: Any) -> str:
+def cell(value: object) -> str:
     """A value in a table."""
     if value is None:
         return "–"

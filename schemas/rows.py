@@ -1,0 +1,178 @@
+"""A row of each table of the history to the type check: its columns by name, None where a row may have no value."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import datetime
+from typing import TypedDict
+
+from fieldcal.names import Json
+
+
+class FlightLead(TypedDict):
+    """What leads every row that speaks of one flight."""
+
+    flight_id: str
+    vehicle_id: str
+    imu_id: str
+    session_id: str
+    started_at: datetime | None
+
+
+class _FlightFacts(FlightLead):
+    log_uri: str
+    log_sha256: str | None
+    log_format: str
+    duration_s: float | None
+    imu_rate_hz: float | None
+    vps_rate_hz: float | None
+    n_samples: int | None
+    temperature_min_degc: float | None
+    temperature_mean_degc: float | None
+    temperature_max_degc: float | None
+    verdict: str
+    reason_code: str | None
+    reason: str | None
+    verifiable: bool | None
+
+
+class FlightRow(_FlightFacts):
+    """A row of `flight`; `findings` is a JSON text."""
+
+    findings: str | None
+
+
+class Finding(TypedDict):
+    """One of the findings of a flight."""
+
+    code: str
+    count: int
+    sentence: str
+
+
+class UnfoldedFlight(_FlightFacts):
+    """A row of `flight` whose findings are objects."""
+
+    findings: list[Finding] | None
+
+
+class CalibrationRow(FlightLead):
+    """A row of `calibration`."""
+
+    sensor: str
+    method: str
+    parameter: str
+    axis: str
+    value: float | None
+    sd: float | None
+    unit: str
+    temperature_degc: float | None
+    status: str
+    reason_code: str | None
+    run_key: str | None
+
+
+class FitRow(FlightLead):
+    """A row of `fit`."""
+
+    quantity: str
+    method: str
+    reference: str
+    signal: str
+    sample: str
+    tic: float | None
+    tic_bias: float | None
+    tic_variance: float | None
+    tic_covariance: float | None
+    rms: float | None
+    rms_unit: str
+    n_samples: int
+    run_key: str | None
+
+
+class SyncRow(FlightLead):
+    """A row of `sync`."""
+
+    lag_s: float | None
+    lag_mid_s: float | None
+    lag_sd_s: float | None
+    skew_ppm: float | None
+    skew_sd_ppm: float | None
+    peak: float | None
+    runner_up: float | None
+    status: str
+    run_key: str | None
+
+
+class Refusable(TypedDict):
+    """What says whether a stage stopped: rows of `run`, and the refusals of a night."""
+
+    stage: str
+    status: str
+    reason_code: str | None
+
+
+class _StageRun(FlightLead, Refusable):
+    run_key: str | None
+
+
+class RunRow(_StageRun):
+    """A row of `run`; `measured` and `versions` are JSON texts."""
+
+    measured: str
+    versions: str | None
+
+
+class UnfoldedRun(_StageRun):
+    """A row of `run` whose JSON texts are objects."""
+
+    measured: Mapping[str, Json]
+    versions: Mapping[str, str] | None
+
+
+class DriftRow(TypedDict):
+    """A row of `drift`."""
+
+    vehicle_id: str
+    imu_id: str
+    sensor: str
+    method: str
+    parameter: str
+    axis: str
+    unit: str
+    n_flights: int
+    value_at_25degc: float | None
+    sd: float | None
+    slope_per_degc: float | None
+    slope_per_degc_sd: float | None
+    slope_per_day: float | None
+    slope_per_day_sd: float | None
+    last_z: float | None
+    change_at: datetime | None
+    status: str
+    n_sessions: int
+    as_of: datetime | None
+    best_known_degc: float | None
+    temperature_min_degc: float | None
+    temperature_max_degc: float | None
+    session_sd: float | None
+    change_size: float | None
+    change_size_sd: float | None
+    fleet_z: float | None
+    reason: str | None
+    best_known_at: datetime | None
+    borrowed_from: int | None
+    curve_per_degc2: float | None
+    curve_per_degc2_sd: float | None
+    curve_per_degc3: float | None
+    curve_per_degc3_sd: float | None
+
+
+class FlightDocument(TypedDict):
+    """What is known of one flight, by table."""
+
+    flight: UnfoldedFlight
+    calibration: list[CalibrationRow]
+    fit: list[FitRow]
+    sync: SyncRow | None
+    run: list[UnfoldedRun]

@@ -1,0 +1,57 @@
+"""The typed dictionaries of the history's rows say what its tables are."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from types import NoneType
+from typing import Any, get_args, get_type_hints
+
+import pyarrow as pa
+import pytest
+
+from fieldcal.schemas import rows, table_columns, table_key
+
+ROWS = {
+    "flight": rows.FlightRow,
+    "calibration": rows.CalibrationRow,
+    "fit": rows.FitRow,
+    "sync": rows.SyncRow,
+    "run": rows.RunRow,
+    "drift": rows.DriftRow,
+}
+TYPES = {
+    pa.string(): str,
+    pa.float64(): float,
+    pa.int64(): int,
+    pa.bool_(): bool,
+    pa.timestamp("us", tz="UTC"): datetime,
+}
+
+
+@pytest.mark.parametrize("table", ROWS)
+def test_a_row_has_the_columns_and_types_of_its_table(table: str) -> None:
+    hints = get_type_hints(ROWS[table])
+    found = {name: next(t for t in get_args(hint) or (hint,) if t is not NoneType) for name, hint in hints.items()}
+    assert found == {column.name: TYPES[column.type] for column in table_columns(table)}
+    assert ROWS[table].__optional_keys__ == frozenset()
+
+
+@pytest.mark.parametrize("table", ROWS)
+def test_none_stands_where_a_column_may_be_null_and_nowhere_in_a_key(table: str) -> None:
+    hints: dict[str, Any] = get_type_hints(ROWS[table])
+    optional = {name for name, hint in hints.items() if NoneType in get_args(hint)}
+    assert {column.name for column in table_columns(table) if "null" in column.meaning} <= optional
+    assert not optional & set(table_key(table))
+
+
+@pytest.mark.parametrize(
+    ("unfolded", "folded", "nested"),
+    [
+        (rows.UnfoldedFlight, rows.FlightRow, {"findings"}),
+        (rows.UnfoldedRun, rows.RunRow, {"measured", "versions"}),
+    ],
+)
+def test_an_unfolded_row_differs_in_its_json_alone(unfolded: type, folded: type, nested: set[str]) -> None:
+    first, second = unfolded.__annotations__, folded.__annotations__
+    assert set(first) == set(second)
+    assert {name for name in first if first[name] != second[name]} == nested
