@@ -477,7 +477,8 @@ def main() -> None:
         raise SystemExit(f"Nothing to change in {arguments.module}; the modules are those of TESTS in this script.")
     scores: dict[str, Score] = {}
     for module, changes in itertools.groupby(drawn, key=lambda c: c.module):
-        known, unknown = [], []
+        known: list[Change] = []
+        unknown: list[Change] = []
         for change in changes:
             (known if (module, line_of(change), change.what) in EQUIVALENT else unknown).append(change)
         alive = survivors(module, unknown, arguments.patience)
