@@ -57,6 +57,7 @@ WHOLE_TIMEOUT_S = 24 * 3600
 ALIVE_SHARE = 1 / 20
 
 TESTS: dict[str, Sequence[str]] = {
+    "logs.mcap.chunks": ("logs/test_mcap_chunks.py",),
     "logs.mcap": ("logs/test_mcap_*.py", "logs/test_logs_mcap*.py", "logs/test_logs_protobuf.py"),
     "logs.csv": ("logs/test_csv_*.py", "logs/test_logs_csv*.py"),
     "logs.encodings": ("logs/test_encodings*.py", "logs/test_logs_mcap.py", "logs/test_logs_protobuf.py"),
@@ -86,7 +87,66 @@ TESTS: dict[str, Sequence[str]] = {
 }
 """Module, or room of modules, below fieldcal → its own tests below tests/. The longest name counts."""
 
-EQUIVALENT: dict[tuple[str, str, str], str] = {}
+_AT_A_TIME = "how much is worked on at a time; the result is the same"
+_ROOM = "room that is filled up to `filled`, which is what is returned"
+_LENGTH = "a transform may be longer than what it transforms"
+_ANY_NEGATIVE = "NumPy takes any negative length for the one that is left over"
+_REFUSED_NEXT = "what the bound lets pass is refused by the end of the last message, two checks on"
+_SPARE_SAMPLES = "spare samples of the padding lie beyond the filter's reach"
+_THREE_TAKEN = "columns_of takes the three of the axes"
+
+EQUIVALENT: dict[tuple[str, str, str], str] = {
+    ("estimation.smoothing", "before, after = x[side:0:-1], x[-2 : -side - 2 : -1]", "2 → 3"): _SPARE_SAMPLES,
+    ("estimation.smoothing", "size = fft.next_fast_len(len(padded) + 2 * side, real=True)", "True → False"): _LENGTH,
+    ("estimation.smoothing", "size = fft.next_fast_len(len(padded) + 2 * side, real=True)", "2 → 3"): _LENGTH,
+    ("estimation.smoothing", "shape = (-1,) + (1,) * (x.ndim - 1)", "1 → 2"): _ANY_NEGATIVE,
+    (
+        "exports.apply",
+        "values = c.readings[name][1] if name in own else np.full((len(t_ns), 3), np.nan)",
+        "3 → 4",
+    ): _THREE_TAKEN,
+    (
+        "exports.apply",
+        "nothing = np.full((len(either[0]), 3), np.nan)",
+        "0 → 1",
+    ): "stamps and readings are equally many",
+    ("exports.apply", 'origin = int(known["t_ns"][0])', "0 → 1"): "an origin near the stamps, for the digits alone",
+    ("logs.mcap.chunks", "ZSTD_WINDOW_CAP_BYTES = 128 << 20", "<< → >>"): "0 stands for Zstandard's own cap: the same",
+    (
+        "logs.mcap.chunks",
+        "ZSTD_WINDOW_CAP_BYTES = 128 << 20",
+        "128 → 140",
+    ): "the next window that a frame can name has 144 MiB",
+    ("logs.mcap.chunks", "_PIECE_BYTES = 1 << 20", "1 → 2"): _AT_A_TIME,
+    ("logs.mcap.chunks", "_PIECE_BYTES = 1 << 20", "20 → 22"): _AT_A_TIME,
+    ("logs.mcap.chunks", "_FED_BYTES = 1 << 16", "1 → 2"): _AT_A_TIME,
+    ("logs.mcap.chunks", "_FED_BYTES = 1 << 16", "16 → 17"): _AT_A_TIME,
+    ("logs.mcap.chunks", "content, filled, position = bytearray(size + 1), 0, 0", "1 → 2"): _ROOM,
+    ("logs.mcap.chunks", "content, filled, position = bytearray(size + 1), 0, 0", "+ → -"): _ROOM,
+    ("logs.mcap.chunks", "content[filled : filled + len(piece)] = piece", "+ → -"): _ROOM,
+    ("logs.mcap.chunks", "room = data.size - HEAD_BYTES - MESSAGE_HEAD_BYTES", "- → +"): _REFUSED_NEXT,
+    (
+        "logs.mcap.chunks",
+        "if np.any(data[starts] != MESSAGE) or int(sizes.max()) > data.size or int(sizes.min()) < MESSAGE_HEAD_BYTES:",
+        "> → >=",
+    ): _REFUSED_NEXT,
+    (
+        "logs.mcap.chunks",
+        "reader = decompressor.stream_reader(packed, read_across_frames=True)",
+        "True → False",
+    ): "the loop reads on behind the end of a frame, until nothing comes",
+    ("logs.tidy", "MOST_INTERVALS = 1 << 20", "1 → 2"): _AT_A_TIME,
+    ("logs.tidy", "MOST_INTERVALS = 1 << 20", "20 → 22"): _AT_A_TIME,
+    ("logs.tidy", "while self._intervals.size > MOST_INTERVALS:", "> → >="): _AT_A_TIME,
+    ("logs.tidy", "self._n_late = 0", "0 → 1"): "the first stamp of all is behind none, which begins the count anew",
+    (
+        "logs.tidy",
+        "self.longest_gap_ns = max(self.longest_gap_ns, int(intervals.max(initial=0)))",
+        "0 → 1",
+    ): "told from a second on",
+    ("logs.stamps", "AT_ONCE = 1 << 17", "1 → 2"): _AT_A_TIME,
+    ("logs.stamps", "AT_ONCE = 1 << 17", "17 → 18"): _AT_A_TIME,
+}
 """(module, the line without its indentation, the change) → why no caller can tell the difference."""
 
 _SWAPS: dict[type[ast.AST], type[ast.AST]] = {
