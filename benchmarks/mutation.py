@@ -7,7 +7,9 @@
 
 Needs the `test` extra and a system with fork. Nothing is written to the checkout: the changed module lives in the
 memory of a forked process. First a module's own tests (`TESTS`) run unchanged, and it is noted which of them pass
-through which line; a change is then shown to the tests of its line, the quickest first, until one fails.
+through which line; a change is then shown to the tests of its line, the quickest first, until one fails. Tests are
+collected once a module, and functions get the changed code in a copy of that process: a fraction of a second a change.
+What runs at import (constants, defaults) is imported anew: some seconds.
 
 A *survivor* is a change that no test noticed. Either the tests miss something: write one that kills it, against a truth
 that does not come from the module (a closed form, another library, the simulator), never against yesterday's output. Or
@@ -22,6 +24,7 @@ from __future__ import annotations
 import argparse
 import ast
 import contextlib
+import gc
 import importlib.machinery
 import importlib.util
 import itertools
@@ -39,7 +42,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from types import CodeType, FrameType
+from types import CodeType, FrameType, FunctionType
 from typing import Any
 
 import pytest
@@ -50,9 +53,11 @@ TESTS_FOLDER = REPOSITORY / "tests"
 Place = ast.expr | ast.stmt
 MEMORY_BYTES = 4 << 30
 LEAST_TIMEOUT_S = 20
+WHOLE_TIMEOUT_S = 24 * 3600
 ALIVE_SHARE = 1 / 20
 
 TESTS: dict[str, Sequence[str]] = {
+    "logs.mcap.chunks": ("logs/test_mcap_chunks.py",),
     "logs.mcap": ("logs/test_mcap_*.py", "logs/test_logs_mcap*.py", "logs/test_logs_protobuf.py"),
     "logs.csv": ("logs/test_csv_*.py", "logs/test_logs_csv*.py"),
     "logs.encodings": ("logs/test_encodings*.py", "logs/test_logs_mcap.py", "logs/test_logs_protobuf.py"),
@@ -82,7 +87,66 @@ TESTS: dict[str, Sequence[str]] = {
 }
 """Module, or room of modules, below fieldcal → its own tests below tests/. The longest name counts."""
 
-EQUIVALENT: dict[tuple[str, str, str], str] = {}
+_AT_A_TIME = "how much is worked on at a time; the result is the same"
+_ROOM = "room that is filled up to `filled`, which is what is returned"
+_LENGTH = "a transform may be longer than what it transforms"
+_ANY_NEGATIVE = "NumPy takes any negative length for the one that is left over"
+_REFUSED_NEXT = "what the bound lets pass is refused by the end of the last message, two checks on"
+_SPARE_SAMPLES = "spare samples of the padding lie beyond the filter's reach"
+_THREE_TAKEN = "columns_of takes the three of the axes"
+
+EQUIVALENT: dict[tuple[str, str, str], str] = {
+    ("estimation.smoothing", "before, after = x[side:0:-1], x[-2 : -side - 2 : -1]", "2 → 3"): _SPARE_SAMPLES,
+    ("estimation.smoothing", "size = fft.next_fast_len(len(padded) + 2 * side, real=True)", "True → False"): _LENGTH,
+    ("estimation.smoothing", "size = fft.next_fast_len(len(padded) + 2 * side, real=True)", "2 → 3"): _LENGTH,
+    ("estimation.smoothing", "shape = (-1,) + (1,) * (x.ndim - 1)", "1 → 2"): _ANY_NEGATIVE,
+    (
+        "exports.apply",
+        "values = c.readings[name][1] if name in own else np.full((len(t_ns), 3), np.nan)",
+        "3 → 4",
+    ): _THREE_TAKEN,
+    (
+        "exports.apply",
+        "nothing = np.full((len(either[0]), 3), np.nan)",
+        "0 → 1",
+    ): "stamps and readings are equally many",
+    ("exports.apply", 'origin = int(known["t_ns"][0])', "0 → 1"): "an origin near the stamps, for the digits alone",
+    ("logs.mcap.chunks", "ZSTD_WINDOW_CAP_BYTES = 128 << 20", "<< → >>"): "0 stands for Zstandard's own cap: the same",
+    (
+        "logs.mcap.chunks",
+        "ZSTD_WINDOW_CAP_BYTES = 128 << 20",
+        "128 → 140",
+    ): "the next window that a frame can name has 144 MiB",
+    ("logs.mcap.chunks", "_PIECE_BYTES = 1 << 20", "1 → 2"): _AT_A_TIME,
+    ("logs.mcap.chunks", "_PIECE_BYTES = 1 << 20", "20 → 22"): _AT_A_TIME,
+    ("logs.mcap.chunks", "_FED_BYTES = 1 << 16", "1 → 2"): _AT_A_TIME,
+    ("logs.mcap.chunks", "_FED_BYTES = 1 << 16", "16 → 17"): _AT_A_TIME,
+    ("logs.mcap.chunks", "content, filled, position = bytearray(size + 1), 0, 0", "1 → 2"): _ROOM,
+    ("logs.mcap.chunks", "content, filled, position = bytearray(size + 1), 0, 0", "+ → -"): _ROOM,
+    ("logs.mcap.chunks", "content[filled : filled + len(piece)] = piece", "+ → -"): _ROOM,
+    ("logs.mcap.chunks", "room = data.size - HEAD_BYTES - MESSAGE_HEAD_BYTES", "- → +"): _REFUSED_NEXT,
+    (
+        "logs.mcap.chunks",
+        "if np.any(data[starts] != MESSAGE) or int(sizes.max()) > data.size or int(sizes.min()) < MESSAGE_HEAD_BYTES:",
+        "> → >=",
+    ): _REFUSED_NEXT,
+    (
+        "logs.mcap.chunks",
+        "reader = decompressor.stream_reader(packed, read_across_frames=True)",
+        "True → False",
+    ): "the loop reads on behind the end of a frame, until nothing comes",
+    ("logs.tidy", "MOST_INTERVALS = 1 << 20", "1 → 2"): _AT_A_TIME,
+    ("logs.tidy", "MOST_INTERVALS = 1 << 20", "20 → 22"): _AT_A_TIME,
+    ("logs.tidy", "while self._intervals.size > MOST_INTERVALS:", "> → >="): _AT_A_TIME,
+    ("logs.tidy", "self._n_late = 0", "0 → 1"): "the first stamp of all is behind none, which begins the count anew",
+    (
+        "logs.tidy",
+        "self.longest_gap_ns = max(self.longest_gap_ns, int(intervals.max(initial=0)))",
+        "0 → 1",
+    ): "told from a second on",
+    ("logs.stamps", "AT_ONCE = 1 << 17", "1 → 2"): _AT_A_TIME,
+    ("logs.stamps", "AT_ONCE = 1 << 17", "17 → 18"): _AT_A_TIME,
+}
 """(module, the line without its indentation, the change) → why no caller can tell the difference."""
 
 _SWAPS: dict[type[ast.AST], type[ast.AST]] = {
@@ -151,9 +215,9 @@ class Baseline:
 class Score:
     """What became of a module's changes."""
 
-    killed: int = 0
-    equivalent: int = 0
-    alive: list[Change] = field(default_factory=list)
+    killed: int
+    equivalent: int
+    alive: list[Change]
 
 
 def places(tree: ast.Module) -> Iterator[tuple[Place, bool, str, Callable[[], None]]]:
@@ -306,19 +370,6 @@ class _Watch:
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         self.baseline.seconds[report.nodeid] = self.baseline.seconds.get(report.nodeid, 0.0) + report.duration
 
-    def pytest_collection_finish(self, session: pytest.Session) -> None:
-        self.baseline.files = {item.nodeid: str(item.path) for item in session.items}
-
-
-class _Chosen:
-    """Plugin of pytest: only these tests, in this order."""
-
-    def __init__(self, tests: Sequence[str]) -> None:
-        self.order = {test: i for i, test in enumerate(tests)}
-
-    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        items[:] = sorted((i for i in items if i.nodeid in self.order), key=lambda i: self.order[i.nodeid])
-
 
 def prepare() -> None:
     """Load what many tests import, so that a forked process need not; one thread, as none lives on in it."""
@@ -329,8 +380,8 @@ def prepare() -> None:
         importlib.import_module(name)
 
 
-def in_child(work: Callable[[Path], int], timeout_s: float) -> int:
-    """Run `work` in a forked process with a folder of its own; its exit code, negative when a signal ended it."""
+def in_child(work: Callable[[Path], int | None], timeout_s: float) -> int:
+    """Run `work` in a forked process with a folder of its own: what it returns, negative when a signal ended it."""
     folder = Path(tempfile.mkdtemp(prefix="mutation-"))
     child = os.fork()
     if not child:
@@ -342,54 +393,123 @@ def in_child(work: Callable[[Path], int], timeout_s: float) -> int:
                 os.dup2(silent, stream)
             resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
             signal.alarm(math.ceil(timeout_s))
-            code = work(folder)
+            code = int(work(folder) or 0)
         finally:
             os._exit(code)
-    _, status = os.waitpid(child, 0)
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(child, signal.SIGKILL)  # processes that a test left behind
-    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        _, status = os.waitpid(child, 0)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child, signal.SIGKILL)  # processes that a test left behind
+        shutil.rmtree(folder, ignore_errors=True)
     return os.waitstatus_to_exitcode(status)
 
 
-def run_tests(files: Sequence[str], folder: Path, plugin: object, *options: str) -> int:
-    """Run pytest in this process, without traces in the checkout."""
+class _Loop:
+    """Plugin of pytest: gives the collected tests to `work` instead of running them."""
+
+    def __init__(self, work: Callable[[pytest.Session], None]) -> None:
+        self.work = work
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        self.work(session)
+        return True
+
+
+def collected(files: Sequence[str], folder: Path, work: Callable[[pytest.Session], None]) -> int:
+    """Let pytest collect tests in this process, without traces in the checkout, and call `work` with them."""
     quiet = ["-q", "-p", "no:cacheprovider", "-W", "ignore", f"--rootdir={REPOSITORY}", f"--basetemp={folder / 'tmp'}"]
-    return int(pytest.main([*quiet, *options, *files], plugins=[plugin]))
+    return int(pytest.main([*quiet, "-o", "tmp_path_retention_policy=none", *files], plugins=[_Loop(work)]))
 
 
-def baseline_of(module: str, timeout_s: float = 1800.0) -> Baseline:
-    """The unchanged module under its own tests. Raises SystemExit when one of them fails."""
-    with tempfile.NamedTemporaryFile() as result:
-
-        def work(folder: Path) -> int:
-            watch = _Watch(source_of(module).resolve())
-            code = run_tests([str(path) for path in tests_of(module)], folder, watch)
-            Path(result.name).write_bytes(pickle.dumps(watch.baseline))
-            return code
-
-        if not tests_of(module) or (code := in_child(work, timeout_s)):
-            raise SystemExit(f"{module}: its own tests fail without any change (exit code {code}); run them by pytest.")
-        return pickle.loads(Path(result.name).read_bytes())
+def run(session: pytest.Session, tests: Sequence[str]) -> bool:
+    """Run these tests of a session in this order up to the first that fails: whether all pass."""
+    order = {test: i for i, test in enumerate(tests)}
+    items = sorted((item for item in session.items if item.nodeid in order), key=lambda item: order[item.nodeid])
+    for item, following in itertools.zip_longest(items, items[1:]):
+        item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+        if session.testsfailed:
+            return False
+    return True
 
 
-def survives(change: Change, baseline: Baseline, patience_s: float) -> bool:
-    """Whether no test of the changed line fails."""
+def replace_functions(change: Change) -> None:
+    """Give the functions of a module that is loaded the code of the changed one."""
+    file = str(source_of(change.module))
+    codes: dict[tuple[str, int], CodeType] = {}
+    left = [compile(changed(change), file, "exec", dont_inherit=True)]
+    while left:
+        code = left.pop()
+        codes[code.co_qualname, code.co_firstlineno] = code
+        left += [part for part in code.co_consts if isinstance(part, CodeType)]
+    for function in gc.get_objects():
+        if isinstance(function, FunctionType) and function.__code__.co_filename == file:
+            function.__code__ = codes[function.__code__.co_qualname, function.__code__.co_firstlineno]
+
+
+def tests_through(change: Change, baseline: Baseline, patience_s: float) -> list[str]:
+    """Tests that pass through the changed line, all when it runs at import; the quickest first."""
     owners = set(baseline.seconds)
     if not change.at_import:
         lines = range(change.line, change.last_line + 1)
         through = set().union(*(baseline.through.get(line, ()) for line in lines))
         owners = {test for test in owners if test in through or baseline.files[test] in through}
-    tests = sorted((t for t in owners if baseline.seconds[t] <= patience_s), key=baseline.seconds.__getitem__)
-    if not tests:
-        return True
-    timeout_s = LEAST_TIMEOUT_S + 4 * sum(baseline.seconds[t] for t in tests)
+    return sorted((t for t in owners if baseline.seconds[t] <= patience_s), key=baseline.seconds.__getitem__)
 
-    def work(folder: Path) -> int:
-        sys.meta_path.insert(0, _Loader(change))
-        return run_tests(sorted({baseline.files[t] for t in tests}), folder, _Chosen(tests), "-x")
 
-    return in_child(work, timeout_s) == 0
+def survivors(module: str, changes: Sequence[Change], patience_s: float) -> list[Change]:
+    """The changes of a module that no test notices. Raises SystemExit when a test fails without any change."""
+    files = [str(path) for path in tests_of(module)]
+    with tempfile.NamedTemporaryFile() as result:
+
+        def watched(session: pytest.Session) -> None:
+            watch = _Watch(source_of(module))
+            session.config.pluginmanager.register(watch)
+            watch.baseline.files = {item.nodeid: str(item.path) for item in session.items}
+            if run(session, list(watch.baseline.files)):
+                Path(result.name).write_bytes(pickle.dumps(watch.baseline))
+
+        def in_functions(session: pytest.Session) -> None:
+            """All changes inside functions: each gets a copy of this process, in which the tests are loaded."""
+            in_child(lambda _: watched(session), WHOLE_TIMEOUT_S)
+            if not (written := Path(result.name).read_bytes()):
+                return
+            baseline: Baseline = pickle.loads(written)
+            alive = []
+            for change in changes:
+                tests = tests_through(change, baseline, patience_s)
+
+                def changed_code(_: Path, change: Change = change, tests: Sequence[str] = tests) -> bool:
+                    replace_functions(change)
+                    return not run(session, tests)
+
+                if not change.at_import and in_child(changed_code, timeout_of(tests, baseline)) == 0:
+                    alive.append(change)
+            Path(result.name).write_bytes(pickle.dumps((baseline, alive)))
+
+        if not files or in_child(lambda folder: collected(files, folder, in_functions), WHOLE_TIMEOUT_S):
+            raise SystemExit(f"{module}: its own tests cannot be collected; run them by pytest.")
+        if not (written := Path(result.name).read_bytes()):
+            raise SystemExit(f"{module}: its own tests fail without any change; run them by pytest.")
+        baseline, alive = pickle.loads(written)
+    for change in changes:
+        if change.at_import:
+            tests = tests_through(change, baseline, patience_s)
+
+            def changed_module(folder: Path, change: Change = change, tests: Sequence[str] = tests) -> bool:
+                sys.meta_path.insert(0, _Loader(change))
+                passed: list[bool] = []
+                code = collected(files, folder, lambda session: passed.append(run(session, tests)))
+                return bool(code) or passed != [True]
+
+            if in_child(changed_module, timeout_of(tests, baseline)) == 0:
+                alive.append(change)
+    return alive
+
+
+def timeout_of(tests: Sequence[str], baseline: Baseline) -> float:
+    """Seconds after which a change is taken to hang."""
+    return LEAST_TIMEOUT_S + 4 * sum(baseline.seconds[test] for test in tests)
 
 
 def line_of(change: Change) -> str:
@@ -417,26 +537,24 @@ def main() -> None:
         raise SystemExit(f"Nothing to change in {arguments.module}; the modules are those of TESTS in this script.")
     scores: dict[str, Score] = {}
     for module, changes in itertools.groupby(drawn, key=lambda c: c.module):
-        score = scores[module] = Score()
-        baseline = baseline_of(module)
+        known: list[Change] = []
+        unknown: list[Change] = []
         for change in changes:
-            if (module, line_of(change), change.what) in EQUIVALENT:
-                score.equivalent += 1
-            elif survives(change, baseline, arguments.patience):
-                score.alive.append(change)
-                where = source_of(module).relative_to(REPOSITORY)
-                print(f"ALIVE {where}:{change.line}: {change.what}    {line_of(change)}", flush=True)
-            else:
-                score.killed += 1
+            (known if (module, line_of(change), change.what) in EQUIVALENT else unknown).append(change)
+        alive = survivors(module, unknown, arguments.patience)
+        score = scores[module] = Score(len(unknown) - len(alive), len(known), alive)
+        for change in sorted(alive, key=lambda c: c.line):
+            where = source_of(module).relative_to(REPOSITORY)
+            print(f"ALIVE {where}:{change.line}: {change.what}    {line_of(change)}")
         print(f"{module}: {score.killed} killed, {len(score.alive)} alive, {score.equivalent} equivalent", flush=True)
 
     print(f"\n{'module':44}{'changes':>9}{'killed':>9}{'alive':>9}{'equivalent':>12}")
     for module, score in scores.items():
         total = score.killed + len(score.alive) + score.equivalent
         print(f"{module:44}{total:>9}{score.killed:>9}{len(score.alive):>9}{score.equivalent:>12}")
-    killed, alive = sum(s.killed for s in scores.values()), sum(len(s.alive) for s in scores.values())
-    share = alive / max(killed + alive, 1)
-    print(f"\n{alive} of {killed + alive} live: {share:.1%}; no more than {ALIVE_SHARE:.0%} may.")
+    n_killed, n_alive = sum(s.killed for s in scores.values()), sum(len(s.alive) for s in scores.values())
+    share = n_alive / max(n_killed + n_alive, 1)
+    print(f"\n{n_alive} of {n_killed + n_alive} live: {share:.1%}; no more than {ALIVE_SHARE:.0%} may.")
     raise SystemExit(share > ALIVE_SHARE)
 
 

@@ -57,7 +57,17 @@ def test_dates_outside_the_models_are_refused(year: int) -> None:
     assert "north_east_down" in refusal.value.sentence
 
 
-@pytest.mark.parametrize(("latitude", "longitude"), [(91.0, 0.0), (-90.1, 0.0), (0.0, 400.0), (float("nan"), 0.0)])
+@pytest.mark.parametrize("latitude", [-90.0, 0.0, 90.0])
+@pytest.mark.parametrize(("longitude", "same"), [(-180.0, 180.0), (360.0, 0.0)])
+def test_longitudes_go_round(latitude: float, longitude: float, same: float) -> None:
+    """Up to the poles."""
+    found, wanted = (world_magnetic_model(latitude, place, 0.0, MID) for place in (longitude, same))
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-3 * NANOTESLA)
+
+
+@pytest.mark.parametrize(
+    ("latitude", "longitude"), [(91.0, 0.0), (-90.1, 0.0), (0.0, 360.5), (0.0, -180.5), (float("nan"), 0.0)]
+)
 def test_no_position_on_the_earth(latitude: float, longitude: float) -> None:
     with pytest.raises(ConfigurationError, match="no position"):
         world_magnetic_model(latitude, longitude, 0.0, MID)
