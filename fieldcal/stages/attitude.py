@@ -47,9 +47,9 @@ def vector_constants(tables: Tables, s: VectorConstants, name: Sensor) -> tuple[
 
     Else what the logged unit says; a magnetometer in a physical unit where the local field is only "norm" is scaled
     to the median length, since attitude needs directions only. None: refused raw counts."""
-    own = constants(tables[name], name) if name in tables else None
-    if own is not None:
-        return own, True
+    fitted_constants = constants(tables[name], name) if name in tables else None
+    if fitted_constants is not None:
+        return fitted_constants, True
     if s.nominal_scale[name] is None and s.units[name] != "counts":
         length = float(np.nanmedian(np.linalg.norm(matrix(tables["samples"], triad(name, "smoothed_")), axis=1)))
         scale = float(np.linalg.norm(s.field_ned)) / length * np.array(s.polarity[name], dtype=np.float64)
@@ -60,7 +60,7 @@ def vector_constants(tables: Tables, s: VectorConstants, name: Sensor) -> tuple[
 def known_vectors(tables: Tables, s: VectorConstants) -> dict[Sensor, tuple[Array, Array]]:
     """Constants of both vector triads, as the attitude stage used them; call only where it gave an attitude."""
     found = {name: vector_constants(tables, s, name)[0] for name in VECTOR_SENSORS}
-    return {name: known for name, known in found.items() if known is not None}
+    return {name: vector for name, vector in found.items() if vector is not None}
 
 
 def body_vectors(
@@ -86,16 +86,16 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
             return StageResult(
                 status=Status.REFUSED, reason_code=ReasonCode(f"no_{name}"), reason=f"Attitude needs a {name}."
             )
-        own, fitted = vector_constants(tables, s, name)
+        triad_constants, fitted = vector_constants(tables, s, name)
         if not fitted:
             fallback.append(name)
-        if own is None:
+        if triad_constants is None:
             return StageResult(
                 status=Status.REFUSED,
                 reason_code=ReasonCode(f"{name}_refused"),
                 reason=f"Attitude needs a calibrated {name}; its fit was refused and raw counts are no vector.",
             )
-        used[name] = own
+        used[name] = triad_constants
     vectors = body_vectors(tables["samples"], used, s, prefix="smoothed_")
     strength, gravity = float(np.linalg.norm(s.field_ned)), s.gravity_mps2
     field_excess = np.linalg.norm(vectors[:, 0], axis=1) / strength - 1.0
@@ -156,7 +156,7 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
 def _contradiction(
     code: ReasonCode, number: float, limit: float, reason: str, measured: dict[str, Json]
 ) -> StageResult:
-    """A refusal that puts both vector triads in question: which of them is wrong cannot be told."""
+    """A refusal that puts both vector triads in question: which of them is wrong cannot be decided."""
     rows = [Fault(name, "", code, number, limit, True, reason) for name in VECTOR_SENSORS]
     return StageResult({"faults": fault_rows(rows)}, Status.REFUSED, code, reason, measured)
 
@@ -168,6 +168,6 @@ def _dip_deg(vectors: Array) -> Array:
 
 
 def sensor_attitude(q: Array, s: Axes) -> Array:
-    """Attitude of the sensor's own axes (n, 4) from that of the body: gyroscope constants live in sensor axes."""
+    """Attitude of the sensor axes (n, 4) from that of the body: gyroscope constants live in sensor axes."""
     axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
     return multiply(q, from_matrix(axes.T))

@@ -70,10 +70,10 @@ def verify_fit(tables: Tables, s: VerifySettings) -> StageResult:
         q = continuous(q)
         rate_logged = matrix(samples, triad("gyroscope", "" if signal == "raw" else "smoothed_"))
         if vps is not None and vps_t is not None:
-            own, near = interpolate_attitude(t, q, vps_t)
+            imu_q, near = interpolate_attitude(t, q, vps_t)
             if near.any():
                 vps_q = matrix(vps, QUATERNION)
-                add("attitude", name, "vps", signal, theil_attitude(vps_q[near], own[near]), "deg")
+                add("attitude", name, "vps", signal, theil_attitude(vps_q[near], imu_q[near]), "deg")
         q_sensor = continuous(sensor_attitude(q, s))
         for method, own_constants in gyros.items():
             if own_constants is None:
@@ -101,9 +101,16 @@ def verify_fit(tables: Tables, s: VerifySettings) -> StageResult:
     joint = constants(tables["joint"], Sensor.GYROSCOPE) if "joint" in tables else None
     if joint is not None and vps is not None and vps_t is not None:
         q = matrix(tables["trajectory"], QUATERNION)
-        own, near = interpolate_attitude(t, continuous(q), vps_t)
+        imu_q, near = interpolate_attitude(t, continuous(q), vps_t)
         if near.any():
-            add("attitude", "joint", "vps", "smoothed", theil_attitude(matrix(vps, QUATERNION)[near], own[near]), "deg")
+            add(
+                "attitude",
+                "joint",
+                "vps",
+                "smoothed",
+                theil_attitude(matrix(vps, QUATERNION)[near], imu_q[near]),
+                "deg",
+            )
         for signal, prefix in (("raw", ""), ("smoothed", "smoothed_")):
             rate = sensor_model.calibrate(matrix(samples, triad("gyroscope", prefix)), *joint)
             relative = propagate_stretches(t, rate, segment)
@@ -170,10 +177,10 @@ def _held_out(
     near = bridged(t, reference_t) & (reference_t >= t[0])
     if near.sum() < 10:
         return
-    own = slerp(t, propagate_stretches(t, rate, stretch), reference_t)[near]
+    imu_q = slerp(t, propagate_stretches(t, rate, stretch), reference_t)[near]
     part = stretch[np.clip(np.searchsorted(t, reference_t, side="right") - 1, 0, len(t) - 1)][near]
     to_sensor = sensor_attitude(q, s)[near]
-    model = start_stretches(own, to_sensor, part, np.ones(len(own)), fixed=False)
+    model = start_stretches(imu_q, to_sensor, part, np.ones(len(imu_q)), fixed=False)
     fit = theil_attitude(continuous(to_sensor), model)
     add("attitude_propagated", "joint", name, "raw", fit, "deg", "held_out")
     if rates is not None:
@@ -218,10 +225,10 @@ def _propagated_against_vps(
     to_sensor = sensor_attitude(matrix(vps, QUATERNION), s)
     near = bridged(t, vps_t)
     index = np.clip(np.searchsorted(t, vps_t), 0, len(t) - 1)
-    own, reference, part = slerp(t, relative, vps_t)[near], to_sensor[near], segment[index][near]
-    if len(own) < 10:
+    imu_q, reference, part = slerp(t, relative, vps_t)[near], to_sensor[near], segment[index][near]
+    if len(imu_q) < 10:
         return
-    model = start_stretches(own, reference, part, np.ones(len(own)), fixed=False)
+    model = start_stretches(imu_q, reference, part, np.ones(len(imu_q)), fixed=False)
     add("attitude_propagated", method, "vps", signal, theil_attitude(continuous(reference), model), "deg")
 
 

@@ -160,7 +160,7 @@ def _gyro_result(
 
 
 def calibrate_gyro_output(tables: Tables, s: GyroOutputSettings) -> StageResult:
-    """samples, attitude, equation-error start → calibration by output error, with the triads' own uncertainty
+    """samples, attitude, equation-error start → calibration by output error, with the triads' uncertainty
     propagated.
 
     It also has the last word on equation error's rows, which it hands on: one that it contradicts is refused."""
@@ -196,7 +196,7 @@ def _contradicted(equation: pl.DataFrame, output: pl.DataFrame) -> list[str]:
 
 
 def _output_error(tables: Tables, s: GyroOutputSettings) -> StageResult:
-    """Output error's own rows."""
+    """Rows of output error."""
     if not s.gyro_output:
         return StageResult(
             status=Status.ABSENT, reason_code=ReasonCode.SWITCHED_OFF, reason="Output error is switched off."
@@ -254,10 +254,10 @@ def _start(
         residual_rms=0.0,
         n_samples=len(t),
     )
-    own = logged_constants(s, Sensor.GYROSCOPE)
-    if own is None:
+    nominal_constants = logged_constants(s, Sensor.GYROSCOPE)
+    if nominal_constants is None:
         return start
-    nominal = replace(start, scale=np.diagonal(own[0]).copy(), bias=own[1])
+    nominal = replace(start, scale=np.diagonal(nominal_constants[0]).copy(), bias=nominal_constants[1])
     error = [
         output_error.attitude_error_median(t, q, c.scale * logged + c.bias, segment, RUN_IN_STRETCH_S, weight)
         for c in (start, nominal)
@@ -266,7 +266,7 @@ def _start(
 
 
 def _suitable_stretch(start: GyroFit, t: Array, logged: Array, tables: Tables) -> float:
-    """Stretch length from the gyroscope's sample-to-sample noise and the attitude's own error."""
+    """Stretch length from the gyroscope's sample-to-sample noise and the attitude's error."""
     noise = white_noise_sigma(logged)
     excess = tables["attitude"]["acceleration_excess_mps2"].to_numpy(), tables["attitude"]["field_excess"].to_numpy()
     error = max(spread_of(excess[0] / 9.81), spread_of(excess[1]))

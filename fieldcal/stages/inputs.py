@@ -32,8 +32,8 @@ def mean_temperature(tables: Tables) -> float | None:
 
 def is_sound(tables: Tables, sensor: str) -> bool:
     """Whether neither the sanity check nor the motors' current found a fatal fault of a sensor."""
-    told = [tables[name] for name in ("faults", "motor_faults") if name in tables]
-    return all(fatal_fault(faults, (sensor,)) is None for faults in told)
+    found = [tables[name] for name in ("faults", "motor_faults") if name in tables]
+    return all(fatal_fault(faults, (sensor,)) is None for faults in found)
 
 
 def in_used_segments(table: pl.DataFrame, segments: pl.DataFrame) -> np.ndarray:

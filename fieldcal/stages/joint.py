@@ -100,17 +100,17 @@ def _held_out(
         return {}
     split = int(HELD_IN_SHARE * len(readings.t))
     part = readings.part(slice(0, split))
-    known: dict[str, tuple[Array, Array] | None] = {
+    start: dict[str, tuple[Array, Array] | None] = {
         name: fit.constants(name)[:2] for name in SENSORS if name in fit.layout
     }
     try:
-        own = fit_joint(*initialise.prepare(part, known, lever_arm=arm), try_lever_arm=arm is None)
-        own, _ = with_poses(own, poses, s)
+        early = fit_joint(*initialise.prepare(part, start, lever_arm=arm), try_lever_arm=arm is None)
+        early, _ = with_poses(early, poses, s)
         kept = [name for name in TERMS if name in fit.layout]
-        own = model_selection.with_terms(own, kept) if kept else own
+        early = model_selection.with_terms(early, kept) if kept else early
     except (UnusableFlight, EstimationError):
         return {}
-    matrix, bias, covariance, _ = triad_of(own, "gyroscope")
+    matrix, bias, covariance, _ = triad_of(early, "gyroscope")
     rows = triad_rows(
         Sensor.GYROSCOPE,
         Method.JOINT,
@@ -134,12 +134,12 @@ def readings_of(tables: Tables, s: JointSettings) -> Readings:
     logged: dict[str, Array] = {name: matrix(samples, triad(name)) for name in SENSORS}
     magnetometer = tables.get("magnetometer_log")
     if magnetometer is not None and len(magnetometer) < SPARSE * len(tables["imu"]):
-        own = np.zeros(len(t), dtype=bool)
+        has_reading = np.zeros(len(t), dtype=bool)
         at = seconds(magnetometer["t_ns"], samples["t_ns"][0])
         before = interval_of(t, at, on_stamp="ends")
         nearest = np.where(at - t[before] < t[before + 1] - at, before, before + 1)
-        own[nearest[np.abs(t[nearest] - at) < 2.0 * float(np.median(np.diff(t)))]] = True
-        logged["magnetometer"] = np.where(own[:, None], logged["magnetometer"], np.nan)
+        has_reading[nearest[np.abs(t[nearest] - at) < 2.0 * float(np.median(np.diff(t)))]] = True
+        logged["magnetometer"] = np.where(has_reading[:, None], logged["magnetometer"], np.nan)
     vectors = {name: x for name, x in logged.items() if name != "gyroscope"}
     given = {name: x if is_sound(tables, name) and np.isfinite(x).any() else None for name, x in vectors.items()}
     return Readings(
@@ -165,7 +165,8 @@ def _warmth(tables: Tables, t: Array) -> Array | None:
 
 
 def start_constants(tables: Tables, s: JointSettings, readings: Readings) -> dict[str, tuple[Array, Array] | None]:
-    """The serial chain's constants where it has them, else what the logged unit says, else refused values, else own."""
+    """The serial chain's constants where it has them, else what the logged unit says, else refused values, else an
+    ellipsoid fit."""
     out: dict[str, tuple[Array, Array] | None] = {}
     magnitudes = {
         Sensor.MAGNETOMETER: float(np.linalg.norm(s.field_ned)),
@@ -209,10 +210,10 @@ def _written(fit: JointFit, tables: Tables, s: JointSettings, axes: Array) -> St
         )
     if Sensor.GYROSCOPE in codes:
         rows += _slope_rows(fit, tables, s, codes[Sensor.GYROSCOPE])
-    bad = [f"{name} {axis}: {c}" for name, own in codes.items() for axis, c in zip(AXES, own, strict=True) if c]
+    bad = [f"{name} {axis}: {c}" for name, of_axis in codes.items() for axis, c in zip(AXES, of_axis, strict=True) if c]
     every = len(bad) == 3 * len(codes)
     measured = _measured(fit, axes)
-    first = next((code for own in codes.values() for code in own if code), None)
+    first = next((code for of_axis in codes.values() for code in of_axis if code), None)
     reason = f"Refused by the joint estimate ({', '.join(bad)}). {measured['advice']}".strip() if bad else None
     if not codes:
         first, reason = (
@@ -233,8 +234,8 @@ def triad_of(fit: JointFit, name: str) -> tuple[Array, Array, Array, Array | Non
         scale, bias, covariance = fit.constants(name)
         return np.diag(scale), bias, covariance, None
     full, bias, covariance = fit.full_constants(name)
-    own = np.ix_([0, 4, 8, 9, 10, 11], [0, 4, 8, 9, 10, 11])
-    return full, bias, covariance[own], np.sqrt(np.diagonal(covariance)[:9]).reshape(3, 3)
+    diagonal = np.ix_([0, 4, 8, 9, 10, 11], [0, 4, 8, 9, 10, 11])
+    return full, bias, covariance[diagonal], np.sqrt(np.diagonal(covariance)[:9]).reshape(3, 3)
 
 
 def _slope_rows(
@@ -371,17 +372,19 @@ def _measured(fit: JointFit, axes: Array) -> dict[str, Json]:
         "advice": advice(fit.model, fit.state, fit.layout, fit.covariance, axes),
     }
     if "dip" in fit.layout:
-        own = fit.layout["dip"].start
+        columns = fit.layout["dip"].start
         measured |= {
             "dip_deg": float(np.degrees(fit.state.values["dip"][0])),
-            "dip_sd_deg": float(np.degrees(np.sqrt(fit.covariance[own, own]))),
+            "dip_sd_deg": float(np.degrees(np.sqrt(fit.covariance[columns, columns]))),
         }
     if fit.lever_arm_test is not None:
         measured["lever_arm_test"] = fit.lever_arm_test
     if "lever_arm" in fit.layout:
-        own = fit.layout["lever_arm"]
+        columns = fit.layout["lever_arm"]
         measured["lever_arm_m"] = [float(v) for v in axes @ fit.state.values["lever_arm"]]
-        measured["lever_arm_sd_m"] = [float(v) for v in np.sqrt(np.diagonal(axes @ fit.covariance[own, own] @ axes.T))]
+        measured["lever_arm_sd_m"] = [
+            float(v) for v in np.sqrt(np.diagonal(axes @ fit.covariance[columns, columns] @ axes.T))
+        ]
     return measured
 
 

@@ -1,4 +1,4 @@
-"""The joint estimate once more with the VPS in it (`use_vps`): prepare the poses, fit, tell what was used."""
+"""The joint estimate once more with the VPS in it (`use_vps`): prepare the poses, fit, report what was used."""
 
 from __future__ import annotations
 
@@ -69,22 +69,22 @@ def with_poses(fit: JointFit, poses: Poses | None, s: VpsReference) -> tuple[Joi
         if vps is None:
             return fit, {"use_vps": False, "use_vps_reason": ReasonCode.VPS_TOO_SHORT}
         start = replace(fit.state, values={**fit.state.values, **vps.start()})
-        own = fit_joint(fit.model, start, try_lever_arm="lever_arm" in fit.layout, vps=vps, levels=fit.levels)
+        refitted = fit_joint(fit.model, start, try_lever_arm="lever_arm" in fit.layout, vps=vps, levels=fit.levels)
     except (UnusableFlight, EstimationError) as error:
         return fit, {"use_vps": False, "use_vps_reason": error.reason_code}
-    return replace(own, iterations=fit.iterations + own.iterations), _told(own, vps, poses)
+    return replace(refitted, iterations=fit.iterations + refitted.iterations), _measured(refitted, vps, poses)
 
 
-def _told(fit: JointFit, vps: VpsRecord, poses: Poses) -> dict[str, Json]:
+def _measured(fit: JointFit, vps: VpsRecord, poses: Poses) -> dict[str, Json]:
     lag, skew = vps.clock_of(fit.state.values)
     sd = np.sqrt(np.diagonal(fit.covariance)[fit.layout["vps_clock"]])
-    residual, known = vps.residual(fit.model, fit.state)
+    residual, available = vps.residual(fit.model, fit.state)
     turned = to_rotation_vector(vps.mounting(fit.state.values))
     return {
         "use_vps": True,
-        "vps_poses": int(known.sum()),
+        "vps_poses": int(available.sum()),
         "vps_poses_refused": int((~vps.used).sum()),
-        "vps_residual_deg": float(np.degrees(np.sqrt(np.mean(np.sum(residual[known] ** 2, axis=1))))),
+        "vps_residual_deg": float(np.degrees(np.sqrt(np.mean(np.sum(residual[available] ** 2, axis=1))))),
         "vps_lag_mid_s": lag - poses.base_s,
         "vps_lag_sd_s": float(sd[0]),
         "vps_skew_ppm": 1e6 * skew,

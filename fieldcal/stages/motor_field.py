@@ -46,8 +46,8 @@ def check_motor_field(tables: Tables, s: VectorsSettings) -> tuple[dict[str, Jso
     whole = np.isfinite(values).all(axis=1)
     if np.count_nonzero(whole) < motor_field.FEWEST_SAMPLES:
         return {}, []
-    known = _approximate(tables, s, values[whole])
-    if known is None:
+    calibration = _approximate(tables, s, values[whole])
+    if calibration is None:
         return {}, []
     for column, (word, unit) in DRIVES.items():
         power = tables["power"].filter(pl.col(column).is_finite())
@@ -58,7 +58,7 @@ def check_motor_field(tables: Tables, s: VectorsSettings) -> tuple[dict[str, Jso
         drive = _drive_at(readings["t_ns"].to_numpy(), power["t_ns"].to_numpy(), power[column].to_numpy())
         rows = np.flatnonzero(whole & np.isfinite(drive))
         rows = rows[:: 1 + len(rows) // MOST_SAMPLES]
-        field = sensor_model.calibrate(values[rows], *known)
+        field = sensor_model.calibrate(values[rows], *calibration)
         found = motor_field.motor_field(field, drive[rows], float(np.linalg.norm(s.field_ned)))
         if found is None:
             continue
@@ -71,9 +71,11 @@ def check_motor_field(tables: Tables, s: VectorsSettings) -> tuple[dict[str, Jso
 def _approximate(tables: Tables, s: VectorsSettings, values: Array) -> tuple[Array, Array] | None:
     """Scale and bias to start from: the magnetometer's, of a refused fit too (the current may be why it was refused),
     else the algebraic fit's; what a constant ellipsoid lacks is fitted beside the current's field."""
-    own = constants(tables["magnetometer"], Sensor.MAGNETOMETER, refused_too=True) if "magnetometer" in tables else None
-    if own is not None and all(np.isfinite(c).all() for c in own):
-        return own
+    fitted = (
+        constants(tables["magnetometer"], Sensor.MAGNETOMETER, refused_too=True) if "magnetometer" in tables else None
+    )
+    if fitted is not None and all(np.isfinite(c).all() for c in fitted):
+        return fitted
     strength, polarity = float(np.linalg.norm(s.field_ned)), s.polarity[Sensor.MAGNETOMETER]
     try:
         fit = ellipsoid.fit_ellipsoid(values, strength, method="li", polarity=polarity)
@@ -83,17 +85,17 @@ def _approximate(tables: Tables, s: VectorsSettings, values: Array) -> tuple[Arr
 
 
 def _drive_at(t_ns: np.ndarray, own_ns: np.ndarray, values: Array) -> Array:
-    """Drive at the stamps, (n,), linear between its own; NaN before, behind and in its pauses."""
-    at, known = (t_ns - own_ns[0]) * 1e-9, (own_ns - own_ns[0]) * 1e-9
-    result = np.interp(at, known, values, left=np.nan, right=np.nan)
-    longest = max(PAUSE_S, PAUSE * float(np.median(np.diff(known))))
-    i = interval_of(known, at, on_stamp="ends")
-    result[known[i + 1] - known[i] > longest] = np.nan
+    """Drive at the stamps, (n,), linear between its readings; NaN before, behind and in its pauses."""
+    at, stamps_s = (t_ns - own_ns[0]) * 1e-9, (own_ns - own_ns[0]) * 1e-9
+    result = np.interp(at, stamps_s, values, left=np.nan, right=np.nan)
+    longest = max(PAUSE_S, PAUSE * float(np.median(np.diff(stamps_s))))
+    i = interval_of(stamps_s, at, on_stamp="ends")
+    result[stamps_s[i + 1] - stamps_s[i] > longest] = np.nan
     return result
 
 
 def _outside(throttle: Array) -> Fault | None:
-    """A throttle that is not in 0 to 1 is in a unit that nobody told."""
+    """A throttle that is not in 0 to 1 is in an unknown unit."""
     low, high = float(throttle.min()), float(throttle.max())
     if low >= 0.0 and high <= 1.0:
         return None

@@ -93,9 +93,9 @@ def smooth(tables: Tables, s: SmoothingSettings) -> StageResult:
         x = logged[rows]
         t = (stamps[rows] - origin) * 1e-9
         smoothed = np.full_like(x, np.nan)
-        known = ~np.isnan(x).any(axis=0)
-        smoothed[:, known] = smoothing.smooth_samples(
-            t, x[:, known], s.smoothing_cutoff_hz, side_s=s.smoothing_side_s, ends=s.smoothing_ends
+        valid = ~np.isnan(x).any(axis=0)
+        smoothed[:, valid] = smoothing.smooth_samples(
+            t, x[:, valid], s.smoothing_cutoff_hz, side_s=s.smoothing_side_s, ends=s.smoothing_ends
         )
         parts.append({"t_ns": stamps[rows], "segment": np.full(len(x), number, dtype=np.int32), "x": x, "s": smoothed})
     if not parts:
@@ -134,22 +134,22 @@ def _whole_stretches(segments: pl.DataFrame, stamps: np.ndarray, logged: Array) 
 
 
 def _magnetometer_at(tables: Tables, stamps: np.ndarray) -> Array:
-    """Magnetometer at the IMU's stamps, (n, 3), linear between its own, held past its ends for the length of a pause;
-    NaN in longer pauses and where there is none."""
+    """Magnetometer at the IMU's stamps, (n, 3), linear between its readings, held past its ends for the length of a
+    pause; NaN in longer pauses and where there is none."""
     magnetometer = tables.get("magnetometer")
     if magnetometer is None or len(magnetometer) < 2:
         return np.full((len(stamps), 3), np.nan)
-    own = magnetometer["t_ns"].to_numpy()
+    stamps_ns = magnetometer["t_ns"].to_numpy()
     values = matrix(magnetometer, triad("magnetometer"))
-    if len(own) == len(stamps) and np.array_equal(own, stamps):
+    if len(stamps_ns) == len(stamps) and np.array_equal(stamps_ns, stamps):
         return values
     origin = stamps[0]
-    at, known = (stamps - origin) * 1e-9, (own - origin) * 1e-9
-    result = np.column_stack([np.interp(at, known, column) for column in values.T])
-    longest = max(MAGNETOMETER_PAUSE_S, MAGNETOMETER_PAUSE * float(np.median(np.diff(known))))
-    i = interval_of(known, at, on_stamp="ends")
-    between = (known[0] <= at) & (at <= known[-1])
-    paused = between & (known[i + 1] - known[i] > longest)
-    beyond = np.maximum(known[0] - at, at - known[-1]) > longest
-    result[(paused & ~np.isin(stamps, own)) | beyond] = np.nan
+    at, stamps_s = (stamps - origin) * 1e-9, (stamps_ns - origin) * 1e-9
+    result = np.column_stack([np.interp(at, stamps_s, column) for column in values.T])
+    longest = max(MAGNETOMETER_PAUSE_S, MAGNETOMETER_PAUSE * float(np.median(np.diff(stamps_s))))
+    i = interval_of(stamps_s, at, on_stamp="ends")
+    between = (stamps_s[0] <= at) & (at <= stamps_s[-1])
+    paused = between & (stamps_s[i + 1] - stamps_s[i] > longest)
+    beyond = np.maximum(stamps_s[0] - at, at - stamps_s[-1]) > longest
+    result[(paused & ~np.isin(stamps, stamps_ns)) | beyond] = np.nan
     return result

@@ -22,7 +22,7 @@ from fieldcal.stages.tables import AXES, CalibrationRow
 class StageResult:
     """Tables that a stage made, how it ended and the numbers that decided it.
 
-    Tables of a refused stage may still carry refused values; an error of ours is told in `reason`.
+    Tables of a refused stage may still carry refused values; an error of ours is described in `reason`.
     """
 
     tables: dict[str, pl.DataFrame] = field(default_factory=dict)
@@ -102,8 +102,8 @@ def triad_rows(
     zero_full = -np.linalg.solve(matrix, b) if full else -b / np.diagonal(matrix)
     offset_full = matrix @ d0 + b
     for i, axis in enumerate(AXES):
-        lam, own = matrix[i, i], np.ix_([i, 3 + i], [i, 3 + i])
-        c = covariance[own]
+        lam, pair = matrix[i, i], np.ix_([i, 3 + i], [i, 3 + i])
+        c = covariance[pair]
         add("scale", axis, i, lam, c[0, 0], scale_unit)
         add("bias", axis, i, b[i], c[1, 1], unit)
         to_zero = np.array([b[i] / lam**2, -1.0 / lam])

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fieldcal.config.stage_settings import SanitySettings
 
 TABLE_OF = {Sensor.GYROSCOPE: "imu", Sensor.ACCELEROMETER: "imu", Sensor.MAGNETOMETER: "magnetometer"}
-"""In the order in which faults are told."""
+"""In the order in which faults are reported."""
 
 
 def check_sensors(tables: Tables, s: SanitySettings) -> StageResult:

@@ -76,7 +76,7 @@ def calibrate_accelerometer(tables: Tables, s: AccelerometerSettings) -> StageRe
 
 
 def _used_readings(tables: Tables, name: Sensor) -> Array | None:
-    """Unsmoothed readings (n, 3) of the used segments at the sensor's own stamps; None when the log has none."""
+    """Unsmoothed readings (n, 3) of the used segments at the sensor's stamps; None when the log has none."""
     if name == Sensor.MAGNETOMETER:
         table = tables.get("magnetometer")
         if table is None or table.is_empty():
@@ -154,9 +154,9 @@ def calibrate_accelerometer_gated(tables: Tables, s: GatedAccelerometerSettings)
     Where the low-passed norm strays from g by more than 1 % rms something else than gravity was sensed: the gate
     (norm near g, slow rotation) then applies if enough of the sphere remains behind it."""
     samples = tables["samples"]
-    own = constants(tables["accelerometer"], Sensor.ACCELEROMETER) if "accelerometer" in tables else None
-    known = own or logged_constants(s, Sensor.ACCELEROMETER)
-    if known is None or samples["gyroscope_x"].null_count() or samples["accelerometer_x"].null_count():
+    fitted = constants(tables["accelerometer"], Sensor.ACCELEROMETER) if "accelerometer" in tables else None
+    calibration = fitted or logged_constants(s, Sensor.ACCELEROMETER)
+    if calibration is None or samples["gyroscope_x"].null_count() or samples["accelerometer_x"].null_count():
         # Nothing to gate with: the first pass again, under the limits that count.
         used = _used_readings(tables, Sensor.ACCELEROMETER)
         return _ellipsoid_stage(Sensor.ACCELEROMETER, tables, s, s.gravity_mps2, "m/s^2", used)
@@ -166,7 +166,7 @@ def calibrate_accelerometer_gated(tables: Tables, s: GatedAccelerometerSettings)
     logged, smoothed = matrix(samples, triad("accelerometer")), matrix(samples, triad("accelerometer", "smoothed_"))
     measured: dict[str, Json] = {"lever_arm_applied": s.lever_arm_m is not None and gyro is not None}
     if gyro is None:
-        # Rates in counts: at rest, the one thing that can be told without a scale.
+        # Rates in counts: at rest, the one thing that can be seen without a scale.
         level, noise = motion_selection.windowed_rate(
             seconds(samples["t_ns"], samples["t_ns"][0]), matrix(samples, triad("gyroscope")), REST_WINDOW_S
         )
@@ -178,9 +178,9 @@ def calibrate_accelerometer_gated(tables: Tables, s: GatedAccelerometerSettings)
         if s.lever_arm_m is not None:
             arm = _lever_arm(samples, rate, s.lever_arm_m, s.differentiation_window_s)
             logged, smoothed = (
-                sensor_model.to_centre_of_mass(x, known[0], arm, axes, s.gravity_sign) for x in (logged, smoothed)
+                sensor_model.to_centre_of_mass(x, calibration[0], arm, axes, s.gravity_sign) for x in (logged, smoothed)
             )
-    norm = np.linalg.norm(sensor_model.calibrate(smoothed, *known), axis=1) / s.gravity_mps2
+    norm = np.linalg.norm(sensor_model.calibrate(smoothed, *calibration), axis=1) / s.gravity_mps2
     quiet = (np.abs(norm - 1.0) < s.gate_norm) & slow
     other = float(np.sqrt(np.mean((norm - 1.0) ** 2)))
     measured |= {"gate_passed": int(quiet.sum()), "gate_share": float(quiet.mean()), "other_acceleration_rms_g": other}
@@ -265,12 +265,12 @@ def judge_vectors(tables: Tables, s: VectorsSettings) -> StageResult:
         return StageResult(
             status=Status.ABSENT, reason_code=ReasonCode.NO_VECTORS, reason="Neither vector triad was calibrated."
         )
-    told = {}
+    fault_table = {}
     if motor_faults:
         measured["faults"] = [fault.plain() for fault in motor_faults]
-        told = {"faults": fault_rows(motor_faults)}
+        fault_table = {"faults": fault_rows(motor_faults)}
     return StageResult(
-        {"calibration": pl.concat(parts), **told},
+        {"calibration": pl.concat(parts), **fault_table},
         reason_code=motor_faults[0].code if motor_faults else None,
         reason=" ".join(fault.sentence for fault in motor_faults) or None,
         measured=measured,

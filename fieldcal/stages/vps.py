@@ -121,14 +121,16 @@ def _refined(
     if table is None or table.is_empty() or not is_sound(tables, "magnetometer"):
         return fit, {"synchronised_by": "gyroscope"}
     logged = matrix(table, triad("magnetometer"))
-    refined, own = refine_by_field(seconds(table["t_ns"], origin), logged, t_vps, q_vps, fit, max_gap_s=s.vps_max_gap_s)
-    if own is None:
+    refined, field_clock = refine_by_field(
+        seconds(table["t_ns"], origin), logged, t_vps, q_vps, fit, max_gap_s=s.vps_max_gap_s
+    )
+    if field_clock is None:
         return fit, {"synchronised_by": "gyroscope"}
     return refined, {
         "synchronised_by": "gyroscope" if refined is fit else "gyroscope and magnetometer",
         # Positive: the magnetometer's readings are older than the gyroscope's.
-        "magnetometer_delay_s": own.lag_mid_s - fit.lag_mid_s,
-        "magnetometer_delay_sd_s": float(np.sqrt(own.covariance[0, 0] + fit.covariance[0, 0])),
+        "magnetometer_delay_s": field_clock.lag_mid_s - fit.lag_mid_s,
+        "magnetometer_delay_sd_s": float(np.sqrt(field_clock.covariance[0, 0] + fit.covariance[0, 0])),
     }
 
 
@@ -139,13 +141,13 @@ def _sync_row(values: dict[str, Json]) -> pl.DataFrame:
 
 def _gyro_constants(tables: Tables, s: LoggedValues) -> tuple[Array, Array] | None:
     """The joint estimate's constants, else output error's, equation error's, what the logged unit says, or None."""
-    own = constants(tables["joint"], Sensor.GYROSCOPE) if "joint" in tables else None
-    if own is not None:
-        return own
+    found = constants(tables["joint"], Sensor.GYROSCOPE) if "joint" in tables else None
+    if found is not None:
+        return found
     for method in (Method.OUTPUT_ERROR, Method.EQUATION_ERROR):
-        own = constants(tables["gyroscope"], Sensor.GYROSCOPE, method) if "gyroscope" in tables else None
-        if own is not None:
-            return own
+        found = constants(tables["gyroscope"], Sensor.GYROSCOPE, method) if "gyroscope" in tables else None
+        if found is not None:
+            return found
     return logged_constants(s, Sensor.GYROSCOPE)
 
 

@@ -70,10 +70,10 @@ def _rows(sensor: Sensor, found: warm_up.WarmUp, s: WarmUpSettings) -> list[Cali
 
 def _resting(tables: Tables, s: WarmUpSettings, t: Array, rate: Array, warm: Array) -> warm_up.WarmUp | None:
     """The accelerometer at rest; None without readings that can be trusted, constants, or such a rest."""
-    known = constants(tables["accelerometer"], Sensor.ACCELEROMETER) if "accelerometer" in tables else None
-    if known is None or not is_sound(tables, "accelerometer"):
+    calibrated = constants(tables["accelerometer"], Sensor.ACCELEROMETER) if "accelerometer" in tables else None
+    if calibrated is None or not is_sound(tables, "accelerometer"):
         return None
-    scale, bias = known
+    scale, bias = calibrated
     logged = matrix(tables["imu"], triad("accelerometer"))
     if np.isnan(logged).any():
         return None

@@ -1,4 +1,4 @@
-"""Flights that stand alone, and steps between sessions: what must be known of a history before a line is drawn."""
+"""Flights that stand alone, and steps between sessions: they are found in a history before a line is drawn."""
 
 from __future__ import annotations
 

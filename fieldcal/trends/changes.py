@@ -38,7 +38,8 @@ class PlainChange(TypedDict):
 
 @dataclass(frozen=True)
 class Change:
-    """One thing to tell, `sentence` for people. `parameters` of an axis that say the same are told together."""
+    """One change to report, `sentence` for people. `parameters` of an axis with the same change are reported
+    together."""
 
     kind: str
     vehicle_id: str
@@ -70,7 +71,7 @@ def changes(
     since: datetime | None = None,
     alerts: Alerts = NORMAL,
 ) -> list[Change]:
-    """What is to be told tonight and was not told by the night before, the gravest first.
+    """What tonight reports and the night before did not, the gravest first.
 
     Parameters
     ----------
@@ -79,13 +80,14 @@ def changes(
     latest : DataFrame
         `last_usable` of the warehouse.
     now, since : datetime
-        Time of this night and of the one before. Without `since` every expired calibration and idle vehicle is told.
+        Time of this night and of the one before. Without `since` every expired calibration and idle vehicle is
+        reported.
     alerts : Alerts
-        Age at which a sensor's latest calibration, a vehicle's latest usable flight, is to be told.
+        Age at which a sensor's latest calibration, a vehicle's latest usable flight, is to be reported.
     """
     both = table.join(former.select(*SERIES, "status", "last_z", "change_at"), on=SERIES, how="left", suffix="_before")
-    told = [*_news(both), *_ages(latest, now, since, alerts)]
-    return sorted(told, key=lambda c: (KINDS.index(c.kind), c.vehicle_id, c.sensor or "", c.axis or ""))
+    found = [*_news(both), *_ages(latest, now, since, alerts)]
+    return sorted(found, key=lambda c: (KINDS.index(c.kind), c.vehicle_id, c.sensor or "", c.axis or ""))
 
 
 def last_usable(root: Path) -> pl.DataFrame:

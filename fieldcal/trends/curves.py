@@ -40,23 +40,23 @@ class Bent:
     wider: Array
 
     def widened(self, trends: Trends) -> Trends:
-        """Trends of `histories` with the bends' own uncertainty in their sd."""
+        """Trends of `histories` with the uncertainty of the bends in their sd."""
         sd, slope_sd = trends.sd * self.wider[:, 0], trends.slope_per_degc_sd * self.wider[:, 1]
         return replace(trends, sd=sd, slope_per_degc_sd=slope_sd)
 
 
 def bends_of(root: Path) -> Bends:
-    """Every warm-up flight's curve, from the stage's own record."""
-    told = Warehouse(root).scan("run").filter((pl.col("stage") == METHOD) & (pl.col("status") == Status.OK))
+    """Every warm-up flight's curve, from the measured numbers of its run."""
+    runs = Warehouse(root).scan("run").filter((pl.col("stage") == METHOD) & (pl.col("status") == Status.OK))
     found: dict[tuple[str, str], Source] = {}
-    for flight_id, text in told.select("flight_id", "measured").collect().iter_rows():
+    for flight_id, text in runs.select("flight_id", "measured").collect().iter_rows():
         curve = json.loads(text or "{}").get(CURVE)
         if curve is None:
             continue
         for i, axis in enumerate("xyz"):
-            own = np.array(curve["coefficients"][i]), np.array(curve["covariance"][i])
-            if np.linalg.matrix_rank(own[1], hermitian=True) == ORDER:
-                found[flight_id, axis] = about_reference(*own, curve["centre_degc"], curve["width_degc"])
+            cubic = np.array(curve["coefficients"][i]), np.array(curve["covariance"][i])
+            if np.linalg.matrix_rank(cubic[1], hermitian=True) == ORDER:
+                found[flight_id, axis] = about_reference(*cubic, curve["centre_degc"], curve["width_degc"])
     return found
 
 
@@ -79,7 +79,7 @@ def bent(flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends: Trends
         curve = combined(warm[imu_id, axis], _sessions(h, i, trends))
         if curve is None:
             continue
-        known = _slope_given(curve, warm[imu_id, axis]) if curve.agrees is not False else (np.nan, np.nan)
+        warm_slope = _slope_given(curve, warm[imu_id, axis]) if curve.agrees is not False else (np.nan, np.nan)
         lever = {"zero": 1.0}
         if (scale := place.get((imu_id, method, "scale", axis))) is not None:
             lever["zero_bias"] = -float(trends.value[scale])
@@ -87,14 +87,14 @@ def bent(flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends: Trends
             j = place.get((imu_id, method, name, axis))
             if j is None or not np.isfinite(factor):
                 continue
-            own = _members(h, j)
-            warmer = np.nan_to_num(h.temperature_degc[own] - REFERENCE_DEGC)
-            value[own] -= factor * (curve.coefficients[1] * warmer**2 + curve.coefficients[2] * warmer**3)
+            members = _members(h, j)
+            warmer = np.nan_to_num(h.temperature_degc[members] - REFERENCE_DEGC)
+            value[members] -= factor * (curve.coefficients[1] * warmer**2 + curve.coefficients[2] * warmer**3)
             of_scale = SCALE_PER_DEGC_SD * abs(float(trends.value[j])) if name == "zero_bias" else 0.0
-            slope[j], slope_sd[j] = factor * known[0], np.hypot(factor * known[1], of_scale)
-            own, variance = _flights(h, j, trends)
-            told = None if curve.agrees is False else warm[imu_id, axis][1] / factor**2
-            wider[j] = widening(h.temperature_degc[own], h.time_day[own], variance, told)
+            slope[j], slope_sd[j] = factor * warm_slope[0], np.hypot(factor * warm_slope[1], of_scale)
+            members, variance = _flights(h, j, trends)
+            by_warm_up = None if curve.agrees is False else warm[imu_id, axis][1] / factor**2
+            wider[j] = widening(h.temperature_degc[members], h.time_day[members], variance, by_warm_up)
             bend[j], bend_sd[j] = factor * curve.coefficients[1:], abs(factor) * curve.sd[1:]
     if np.isnan(bend).all():
         return None
@@ -102,35 +102,35 @@ def bent(flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends: Trends
 
 
 def _warm(flights: pl.DataFrame, bends: Bends) -> dict[tuple[str, str], Source]:
-    """(IMU, axis) → what its warm-up flights say together; their scatter about it widens it."""
-    own = flights.filter(sensor="gyroscope", method=METHOD, parameter=PARAMETER)
+    """(IMU, axis) → its warm-up flights' cubics combined; their scatter about the mean widens its sd."""
+    fitted = flights.filter(sensor="gyroscope", method=METHOD, parameter=PARAMETER)
     sources: dict[tuple[str, str], list[Source]] = {}
-    for imu_id, flight_id, axis in own.select("imu_id", "flight_id", "axis").iter_rows():
+    for imu_id, flight_id, axis in fitted.select("imu_id", "flight_id", "axis").iter_rows():
         if (flight_id, axis) in bends:
             sources.setdefault((imu_id, axis), []).append(bends[flight_id, axis])
     result = {}
     for key, several in sources.items():
-        told = np.stack([c for c, _ in several]), np.stack([n for _, n in several])
-        c, information, squares, freedom = together(*told)
+        cubics = np.stack([c for c, _ in several]), np.stack([n for _, n in several])
+        c, information, squares, freedom = together(*cubics)
         result[key] = c, information / max(1.0, squares / freedom if freedom else 1.0)
     return result
 
 
 def _sessions(h: Histories, row: int, trends: Trends) -> Source | None:
-    """What flights at different temperatures say."""
-    own, variance = _flights(h, row, trends)
+    """The cubic of flights at different temperatures; None where it cannot be fitted."""
+    members, variance = _flights(h, row, trends)
     if np.isfinite(trends.change_size[row]) or not (variance > 0.0).all():
         return None
-    return of_sessions(h.temperature_degc[own], h.time_day[own], h.value[own], variance)
+    return of_sessions(h.temperature_degc[members], h.time_day[members], h.value[members], variance)
 
 
 def _flights(h: Histories, row: int, trends: Trends) -> tuple[np.ndarray, Array]:
     """Flights of a row that count, and their variance with the scatter between sessions."""
-    own = _members(h, row)
-    known = np.isfinite(h.temperature_degc[own]) & np.isfinite(h.sd[own]) & np.isfinite(h.time_day[own])
-    own = own[trends.kept[own] & known]
+    members = _members(h, row)
+    complete = np.isfinite(h.temperature_degc[members]) & np.isfinite(h.sd[members]) & np.isfinite(h.time_day[members])
+    members = members[trends.kept[members] & complete]
     scatter = np.nan_to_num(trends.session_sd[row]) ** 2 + np.nan_to_num(trends.flight_sd[row]) ** 2
-    return own, np.maximum(h.sd[own] ** 2 + scatter, 1e-300)
+    return members, np.maximum(h.sd[members] ** 2 + scatter, 1e-300)
 
 
 def _members(h: Histories, row: int) -> np.ndarray:
@@ -138,7 +138,7 @@ def _members(h: Histories, row: int) -> np.ndarray:
 
 
 def _slope_given(curve: Curve, warm: Source) -> tuple[float, float]:
-    """(c1, sd) of the warm-up flights alone once square and cube are known; the sessions' is in the regression."""
+    """(c1, sd) of the warm-up flights alone, given square and cube; the sessions' is in the regression."""
     c, information = warm
     first = float(information[0, 0])
     return float((information[0] @ c - information[0, 1:] @ curve.coefficients[1:]) / first), 1.0 / np.sqrt(first)

@@ -18,7 +18,7 @@ from fieldcal.trends.evidence import evidence
 from fieldcal.trends.evidence_cache import Memory
 from fieldcal.trends.reasons import AGREEMENT, VPS, reason
 from fieldcal.trends.series import ENOUGH_SESSIONS, Histories
-from fieldcal.trends.warm_up_slopes import known_slopes
+from fieldcal.trends.warm_up_slopes import slopes_of_warm_ups
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.layout import history_files, vehicle_of
 from fieldcal.warehouse.publish import publish
@@ -101,8 +101,8 @@ def table_of(flights: pl.DataFrame, bends: Bends = NO_BENDS, memory: Memory | No
         status=pl.Series(regression.statuses(trends, fleet_p).tolist(), dtype=pl.String),
     )
     reasons = [reason(row) for row in typed(result.iter_rows(named=True), DriftRow)]
-    told = result.with_columns(reason=pl.Series(reasons, dtype=pl.String))
-    return told.select(TABLES["drift"].column_names).sort(KEY)
+    explained = result.with_columns(reason=pl.Series(reasons, dtype=pl.String))
+    return explained.select(TABLES["drift"].column_names).sort(KEY)
 
 
 def history_of_everything(root: Path) -> pl.DataFrame:
@@ -176,8 +176,8 @@ def trends_of(
     imu = rows["imu_id"].rle_id().to_numpy()
     trends = regression.judge(memory.of(kept, imu), kept.kind)
     curves = bent(flights, kept, rows, trends, bends)
-    if (known := known_slopes(flights, kept, rows, trends)) is not None:
-        slope, slope_sd = known
+    if (slopes := slopes_of_warm_ups(flights, kept, rows, trends)) is not None:
+        slope, slope_sd = slopes
         if curves is not None:
             is_bent = np.isfinite(curves.bend).all(axis=1)
             kept = curves.histories
@@ -211,7 +211,7 @@ def _sign(rows: pl.DataFrame, trends: regression.Trends) -> np.ndarray:
 
 
 def _siblings(rows: pl.DataFrame, trends: regression.Trends) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(group (g,), kind, value, sd) that siblings are compared by. Too short histories are groups of their own; groups
+    """(group (g,), kind, value, sd) that siblings are compared by. Each too short history is a group by itself; groups
     that differ in the axis alone are of a kind.
 
     A VPS clock's lag is arbitrary, its scatter from session to session is not: there the logarithm of the scatter."""

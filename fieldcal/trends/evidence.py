@@ -20,9 +20,9 @@ FALSE_ALARMS = 0.01
 MOST_STEPS = 3
 STEPS_THAT_DRIFT = 0.05
 """Share of stepping units that are taken to drift as well, before their record is looked at. A slope in time and a step
-tell much the same story: a slope that is not there would double the sd of the step's size, one that is there and left
+explain much the same data: a slope that is not there would double the sd of the step's size, one that is there and left
 out would shift it."""
-TOLD = (
+ESTIMATES = (
     "value",
     "sd",
     "slope_per_degc",
@@ -46,10 +46,11 @@ TOLD = (
 
 @dataclass(frozen=True)
 class Evidence:
-    """One entry a row. `told`: by name (`TOLD`) and number of steps, (g, MOST_STEPS + 1), NaN where that is not asked;
-    `step_p` (g, MOST_STEPS): chance of another such step when so many are known, NaN where fewer are in question.
+    """One entry a row. `estimates`: by name (`ESTIMATES`) and number of steps, (g, MOST_STEPS + 1), NaN where that is
+    not asked; `step_p` (g, MOST_STEPS): chance of another such step when so many are given, NaN where fewer are in
+    question.
 
-    Variances, `last_error`, `last_line` (the line's own variance at the last flight), `last_variance` and `moved` are
+    Variances, `last_error`, `last_line` (the line's variance at the last flight), `last_variance` and `moved` are
     in units of the row's `unit`. `enough`: sessions for a trend; `timed`: flights have an order; `last_kept`: whether
     the last flight is in the fit; `kept` (n,): flights that count.
     """
@@ -63,7 +64,7 @@ class Evidence:
     last_variance: Array
     last_kept: np.ndarray
     step_p: Array
-    told: dict[str, Array]
+    estimates: dict[str, Array]
     kept: np.ndarray
 
 
@@ -78,15 +79,15 @@ def evidence(h: Histories) -> Evidence:
     p = prepare(h)
     g = len(p.unit)
     steps, step_p = _steps(p)
-    told = {name: np.full((g, MOST_STEPS + 1), np.nan) for name in TOLD}
+    estimates = {name: np.full((g, MOST_STEPS + 1), np.nan) for name in ESTIMATES}
     for count in range(MOST_STEPS + 1):
         rows = np.arange(g) if count == 0 else np.flatnonzero(steps[:, count - 1] >= 0)
         if not len(rows):
             break
-        own_h, own, sessions = (h, p, None) if count == 0 else _part(h, p, rows)
+        part_h, part, sessions = (h, p, None) if count == 0 else _part(h, p, rows)
         first = steps[rows, :count] if sessions is None else np.searchsorted(sessions, steps[rows, :count])
-        for name, column in _told(own_h, own, first).items():
-            told[name][rows, count] = column
+        for name, column in _estimates(part_h, part, first).items():
+            estimates[name][rows, count] = column
     last = np.maximum(p.last(p.usable), 0)
     return Evidence(
         n_flights=p.n_flights,
@@ -98,7 +99,7 @@ def evidence(h: Histories) -> Evidence:
         last_variance=p.variance[last],
         last_kept=p.keep[last],
         step_p=step_p,
-        told=told,
+        estimates=estimates,
         kept=p.keep,
     )
 
@@ -127,12 +128,12 @@ def _steps(p: Prepared) -> tuple[np.ndarray, Array]:
         sessions, x = sessions[kept], x[kept]
         if not len(rows):
             break
-        own = np.searchsorted(rows, owner[sessions])
-        index, p_value[rows, i] = strongest_step(own, x, level[sessions], weight[sessions], len(rows))
+        row = np.searchsorted(rows, owner[sessions])
+        index, p_value[rows, i] = strongest_step(row, x, level[sessions], weight[sessions], len(rows))
         first = np.where(index >= 0, sessions[np.maximum(index, 0)], -1)
         asked = (p_value[rows, i] <= FALSE_ALARMS) & (first >= 0)
         steps[rows[asked], i] = first[asked]
-        x = np.column_stack([x, (sessions >= first[own]) & there[sessions]])
+        x = np.column_stack([x, (sessions >= first[row]) & there[sessions]])
         rows = rows[asked]
     return steps, p_value
 
@@ -148,16 +149,16 @@ def _part(h: Histories, p: Prepared, rows: np.ndarray) -> tuple[Histories, Prepa
     slope, slope_sd = (None if s is None else s[rows] for s in (h.slope_per_degc, h.slope_per_degc_sd))
     by_row = {name: getattr(p, name)[rows] for name in ("centre", "unit", "x_centre", "x_width", "enough", "timed")}
     kept = {name: getattr(p, name)[members] for name in ("y", "variance", "regressors", "usable", "keep")}
-    own = Histories(row, **by_flight, slope_per_degc=slope, slope_per_degc_sd=slope_sd)
-    return own, replace(p, grouping=part, **by_row, **kept), sessions
+    part_h = Histories(row, **by_flight, slope_per_degc=slope, slope_per_degc_sd=slope_sd)
+    return part_h, replace(p, grouping=part, **by_row, **kept), sessions
 
 
-def _told(h: Histories, p: Prepared, steps: np.ndarray) -> dict[str, Array]:
+def _estimates(h: Histories, p: Prepared, steps: np.ndarray) -> dict[str, Array]:
     """The line with these steps (g, count), first sessions after each, in the units of the rows."""
     first = steps[p.grouping.row]
     design = np.column_stack([p.regressors, (p.grouping.session[:, None] >= first).astype(float)])
-    known, known_variance = _known(h, p, design.shape[1])
-    fit = fit_random_effects(p.grouping, design, p.y, p.variance, p.keep, known=known, known_variance=known_variance)
+    given, given_variance = _given_slope(h, p, design.shape[1])
+    fit = fit_random_effects(p.grouping, design, p.y, p.variance, p.keep, given=given, given_variance=given_variance)
     last, g = p.last(p.keep), len(p.unit)
     there, warm = last >= 0, fit.active[:, TEMPERATURE]
     direction = design[np.maximum(last, 0)].copy()
@@ -219,16 +220,16 @@ def _last_error(p: Prepared, design: Array, fit: Regression) -> tuple[Array, Arr
     return error, np.asarray(np.einsum("gp,gpq,gq->g", x, fit.covariance, x))
 
 
-def _known(h: Histories, p: Prepared, n_columns: int) -> tuple[Array | None, Array | None]:
+def _given_slope(h: Histories, p: Prepared, n_columns: int) -> tuple[Array | None, Array | None]:
     """The warm-up flights' slope in the coordinates of the regression."""
     if h.slope_per_degc is None or h.slope_per_degc_sd is None:
         return None, None
-    known, variance = np.zeros((len(p.unit), n_columns)), np.full((len(p.unit), n_columns), np.inf)
+    given, variance = np.zeros((len(p.unit), n_columns)), np.full((len(p.unit), n_columns), np.inf)
     factor = p.x_width[:, TEMPERATURE] / p.unit
     there = np.isfinite(h.slope_per_degc) & np.isfinite(h.slope_per_degc_sd) & (h.slope_per_degc_sd > 0)
-    known[there, TEMPERATURE] = (h.slope_per_degc * factor)[there]
+    given[there, TEMPERATURE] = (h.slope_per_degc * factor)[there]
     variance[there, TEMPERATURE] = ((h.slope_per_degc_sd * factor) ** 2)[there]
-    return known, variance
+    return given, variance
 
 
 def _latest_step(h: Histories, p: Prepared, design: Array, steps: np.ndarray) -> tuple[Array, Array, Array]:
@@ -245,20 +246,20 @@ def _latest_step(h: Histories, p: Prepared, design: Array, steps: np.ndarray) ->
     data = p.y, p.variance, p.keep
     sloped = fit_random_effects(p.grouping, design, *data)
     plain = fit_random_effects(p.grouping, np.where(np.arange(design.shape[1]) == TIME, 0.0, design), *data)
-    own, latest = np.arange(g), steps.argmax(axis=1)
+    rows, latest = np.arange(g), steps.argmax(axis=1)
     column = TIME + 1 + latest
     t2 = sloped.coefficients[:, TIME] ** 2 / np.maximum(sloped.covariance[:, TIME, TIME], 1e-300)
     n, freedom = p.n_sessions, np.maximum(sloped.freedom, 1.0)
     log_odds = 0.5 * (n * np.log1p(t2 / freedom) - np.log(n)) + special.logit(STEPS_THAT_DRIFT)
     drifts = np.where(sloped.active[:, TIME], special.expit(log_odds), 0.0)
-    with_slope, without = sloped.coefficients[own, column], plain.coefficients[own, column]
+    with_slope, without = sloped.coefficients[rows, column], plain.coefficients[rows, column]
     mean = drifts * with_slope + (1.0 - drifts) * without
     variance = (
-        drifts * sloped.covariance[own, column, column]
-        + (1.0 - drifts) * plain.covariance[own, column, column]
+        drifts * sloped.covariance[rows, column, column]
+        + (1.0 - drifts) * plain.covariance[rows, column, column]
         + drifts * (1.0 - drifts) * (with_slope - without) ** 2
     )
     first = np.full(len(p.grouping.row_of_session), len(h.row))
     index = np.flatnonzero(p.keep)
     np.minimum.at(first, p.grouping.session[index], index)
-    return h.time_day[first[steps[own, latest]]], p.unit * mean, p.unit * np.sqrt(variance)
+    return h.time_day[first[steps[rows, latest]]], p.unit * mean, p.unit * np.sqrt(variance)

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from fieldcal.estimation.segments import run_starts
-from fieldcal.trends.evidence import TOLD, Evidence, evidence
+from fieldcal.trends.evidence import ESTIMATES, Evidence, evidence
 from fieldcal.trends.series import Histories
 from fieldcal.warehouse.files import write_bytes
 
 PLACE = Path("night") / "drift_evidence.npz"
-BY_ROW = tuple(field.name for field in fields(Evidence) if field.name not in ("told", "kept"))
+BY_ROW = tuple(field.name for field in fields(Evidence) if field.name not in ("estimates", "kept"))
 Arrays = dict[str, np.ndarray]
 
 
@@ -50,7 +50,7 @@ class Memory:
         several = [self._used[key] for key in keys]
         everything = _joined(several)
         arrays = {name: getattr(everything, name) for name in (*BY_ROW, "kept")}
-        arrays |= {f"told_{name}": everything.told[name] for name in TOLD}
+        arrays |= {f"estimate_{name}": everything.estimates[name] for name in ESTIMATES}
         sizes = np.array([[len(e.unit), len(e.kept)] for e in several])
         stream = io.BytesIO()
         np.savez_compressed(stream, keys=np.array(keys), sizes=sizes, **arrays)
@@ -98,7 +98,9 @@ def _key(h: Histories, code: str) -> str:
 
 def _joined(several: list[Evidence]) -> Evidence:
     columns = {name: np.concatenate([getattr(e, name) for e in several]) for name in (*BY_ROW, "kept")}
-    return Evidence(**columns, told={name: np.concatenate([e.told[name] for e in several]) for name in TOLD})
+    return Evidence(
+        **columns, estimates={name: np.concatenate([e.estimates[name] for e in several]) for name in ESTIMATES}
+    )
 
 
 def _read(path: Path) -> Iterator[tuple[str, Evidence]]:
@@ -110,7 +112,7 @@ def _read(path: Path) -> Iterator[tuple[str, Evidence]]:
         return
     with np.load(io.BytesIO(data[32:]), allow_pickle=False) as stored:
         arrays: Arrays = {name: stored[name] for name in stored.files}
-    if set(arrays) != {"keys", "sizes", "kept", *BY_ROW, *(f"told_{name}" for name in TOLD)}:
+    if set(arrays) != {"keys", "sizes", "kept", *BY_ROW, *(f"estimate_{name}" for name in ESTIMATES)}:
         return
     ends = np.cumsum(arrays["sizes"], axis=0)
     for key, (g, n), (row_end, end) in zip(arrays["keys"].tolist(), arrays["sizes"], ends, strict=True):
@@ -119,7 +121,7 @@ def _read(path: Path) -> Iterator[tuple[str, Evidence]]:
             key,
             Evidence(
                 **{name: arrays[name][rows] for name in BY_ROW},
-                told={name: arrays[f"told_{name}"][rows] for name in TOLD},
+                estimates={name: arrays[f"estimate_{name}"][rows] for name in ESTIMATES},
                 kept=arrays["kept"][end - n : end],
             ),
         )

@@ -1,9 +1,9 @@
 """What a unit of few sessions borrows from its siblings: their scatter between sessions and their slope on temperature.
 
-Two to four sessions tell neither scatter nor slope. With the siblings' the mean of the sessions can be brought to one
-temperature and has an honest sd (empirical Bayes): y = value + slope (T − 25 °C) + u + e with slope ~ N(m, ω²) and u of
-variance τ², all three from the siblings. Sessions that scatter beyond that are not averaged: one of them may be a step.
-"""
+Two to four sessions determine neither scatter nor slope. With the siblings' the mean of the sessions can be brought to
+one temperature and has an honest sd (empirical Bayes): y = value + slope (T − 25 °C) + u + e with slope ~ N(m, ω²) and
+u of variance τ², all three from the siblings. Sessions that scatter beyond that are not averaged: one of them may be a
+step."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def borrow(h: Histories, trends: Trends, group: np.ndarray, sign: Array, steady:
         Rows that may lend: they have a trend and neither stepped nor drift.
     """
     names = ("value", "sd", "slope_per_degc", "slope_per_degc_sd", "best_degc", "session_sd", "flight_sd", "last_z")
-    told = {name: getattr(trends, name).copy() for name in names}
+    columns = {name: getattr(trends, name).copy() for name in names}
     siblings = np.full(len(group), np.nan)
     few = (trends.n_sessions >= LEAST_SESSIONS) & (trends.n_sessions < ENOUGH_SESSIONS)
     starts = np.searchsorted(h.row, np.arange(len(group) + 1))
@@ -63,26 +63,26 @@ def borrow(h: Histories, trends: Trends, group: np.ndarray, sign: Array, steady:
             continue
         for row in members[few[members]]:
             flights = np.arange(starts[row], starts[row + 1])[trends.kept[starts[row] : starts[row + 1]]]
-            own = replace(lent, slope=lent.slope * float(sign[row]))
-            found = _with(own, h, flights)
+            mounted = replace(lent, slope=lent.slope * float(sign[row]))
+            found = _with(mounted, h, flights)
             if found is None:
                 continue
             siblings[row] = lent.siblings
             for name, value in zip(names, found, strict=True):
-                told[name][row] = value
-    return replace(trends, **told), siblings
+                columns[name][row] = value
+    return replace(trends, **columns), siblings
 
 
 def _lent(trends: Trends, lenders: np.ndarray, sign: Array) -> Lent | None:
     """Medians over the siblings for the scatter. Slopes: mean m and predictive variance ω² = s²(1 + 1/k)(k − 1)/(k − 3)
-    of those that are no outliers (variance of Student's t; k ≥ 5); their own errors stay in ω, which is then rather too
+    of those that are no outliers (variance of Student's t; k ≥ 5); their errors stay in ω, which is then rather too
     large."""
     if len(lenders) < ENOUGH_SIBLINGS:
         return None
     session, flight = trends.session_sd[lenders], trends.flight_sd[lenders]
     slopes, slopes_sd = (sign * trends.slope_per_degc)[lenders], trends.slope_per_degc_sd[lenders]
-    known = np.isfinite(slopes)
-    slopes, slopes_sd = slopes[known], slopes_sd[known]
+    finite = np.isfinite(slopes)
+    slopes, slopes_sd = slopes[finite], slopes_sd[finite]
     if len(slopes) > ENOUGH_SIBLINGS:
         slopes = slopes[~outliers(slopes, slopes_sd, REFERENCE_LEVEL)]
     k = len(slopes)
@@ -100,13 +100,13 @@ def _lent(trends: Trends, lenders: np.ndarray, sign: Array) -> Lent | None:
 
 def _with(lent: Lent, h: Histories, flights: np.ndarray) -> tuple[float, ...] | None:
     """(value, sd, slope, its sd, best °C, τ, φ, last z) of one row; None where its sessions contradict each other or
-    something that is needed is unknown."""
+    something that is needed is missing."""
     y, s, warm, session = h.value[flights], h.sd[flights], h.temperature_degc[flights], h.session[flights]
     if not (np.isfinite(s).all() and np.isfinite(warm).all()):
         return None
     dt = warm - REFERENCE_DEGC
-    own = np.diag(s**2 + lent.flight_variance)
-    v = own + lent.session_variance * (session[:, None] == session) + lent.slope_sd**2 * np.outer(dt, dt)
+    of_flights = np.diag(s**2 + lent.flight_variance)
+    v = of_flights + lent.session_variance * (session[:, None] == session) + lent.slope_sd**2 * np.outer(dt, dt)
     left = y - lent.slope * dt
     value, variance, squares = _mean(v, left)
     alone = _mean(v - lent.slope_sd**2 * np.outer(dt, dt), left)[2]

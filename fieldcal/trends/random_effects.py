@@ -19,7 +19,7 @@ STILL = 1e-9
 """A scaled regressor that moves less than this within a session stands still there."""
 LEAST_FREEDOM = 0.01
 WITHIN_FREEDOM = 3
-"""Flights beyond the first of their session that it takes to tell a flight's own scatter from the session's."""
+"""Flights beyond the first of their session that it takes to tell the scatter of flights from that of sessions."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ def fit_random_effects(
     variance: Array,
     keep: np.ndarray,
     *,
-    known: Array | None = None,
-    known_variance: Array | None = None,
+    given: Array | None = None,
+    given_variance: Array | None = None,
 ) -> Regression:
     """Generalised least squares of y = Xβ + u_session + e with var e = s² + φ² and var u = τ².
 
@@ -97,8 +97,8 @@ def fit_random_effects(
         y and s², scaled to O(1) by row; s² > 0.
     keep : (n,) bool array
         Flights that count.
-    known, known_variance : (g, p) arrays, optional
-        Coefficients known from elsewhere with independent errors; variance inf: not known.
+    given, given_variance : (g, p) arrays, optional
+        Coefficients estimated elsewhere with independent errors; variance inf: not estimated.
 
     References
     ----------
@@ -106,9 +106,9 @@ def fit_random_effects(
     """
     active = grouping.by_row((design * keep[:, None]) ** 2) > 0.0
     information, prior = np.zeros(active.shape), np.zeros(active.shape)
-    if known is not None and known_variance is not None:
-        information = np.where(np.isfinite(known_variance), 1.0 / np.maximum(known_variance, 1e-30), 0.0)
-        prior = np.where(information > 0.0, known, 0.0)
+    if given is not None and given_variance is not None:
+        information = np.where(np.isfinite(given_variance), 1.0 / np.maximum(given_variance, 1e-30), 0.0)
+        prior = np.where(information > 0.0, given, 0.0)
     active |= information > 0.0
     flights = grouping.by_row(keep.astype(float))
     sessions = grouping.sessions_by_row((grouping.by_session(keep.astype(float)) > 0.0).astype(float))

@@ -17,11 +17,11 @@ def reason(row: DriftRow) -> str | None:
     unit = "" if row["unit"] in (None, "1") else f" {row['unit']}"
     if row["status"] == DriftStatus.INSUFFICIENT:
         sessions = row["n_sessions"]
-        told = f"{sessions} session{'' if sessions == 1 else 's'}: a trend needs {ENOUGH_SESSIONS}."
+        sentence = f"{sessions} session{'' if sessions == 1 else 's'}: a trend needs {ENOUGH_SESSIONS}."
         if row["borrowed_from"] is None:
-            return told
+            return sentence
         lent = f"scatter between sessions ({number(row['session_sd'])}{unit}) and slope are those of"
-        return f"{told} The value is the sessions' mean; {lent} {row['borrowed_from']} siblings."
+        return f"{sentence} The value is the sessions' mean; {lent} {row['borrowed_from']} siblings."
     if row["status"] == DriftStatus.STEP:
         size = with_sd(row["change_size"], row["change_size_sd"])
         return f"Stepped by {size}{unit} before the flight of {row['change_at']:%Y-%m-%d %H:%M} UTC."

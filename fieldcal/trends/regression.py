@@ -2,15 +2,14 @@
 
     y = value(25 °C, last flight) + slope_T (T − 25 °C) + slope_t (t − t_last) − Σ steps still to come + u + e
 
-u is the scatter between sessions (every power-up has its own), e the flight's own error. Before the line is drawn,
+u is the scatter between sessions (drawn anew at every power-up), e the error of a flight. Before the line is drawn,
 flights that agree with none of their neighbours are set aside and steps are looked for; what the record then says of
 each number, with its standard deviation, is in `Trends`. A history is a row; all rows of a fleet go in together: the
 share of false alarms is controlled over all of them.
 
 Sessions are taken as independent draws about the line, and the line as straight. A parameter that wanders from session
-to session (a random walk) is therefore told as drifting or stepping sooner than these shares say, and one whose curve
-over temperature bends is told with its bend as scatter.
-"""
+to session (a random walk) is therefore reported as drifting or stepping sooner than these shares say, and one whose
+curve over temperature bends is reported with its bend as scatter."""
 
 from __future__ import annotations
 
@@ -34,7 +33,7 @@ LEAST_LEFT = 0.05
 
 @dataclass(frozen=True)
 class Trends:
-    """What the histories say, one entry a row; NaN where the record does not tell.
+    """The regression of each history, one entry a row; NaN where the record does not determine it.
 
     `n_flights`, `n_sessions`: that count; `value`, `sd`: at 25 °C as of the last flight that counts; `best_degc`:
     temperature at which the value is independent of the slope, so that var(T) = var(best) + slope_sd² (T − best)²;
@@ -85,11 +84,11 @@ def analyse(h: Histories) -> Trends:
 def judge(e: Evidence, kind: np.ndarray | None = None) -> Trends:
     """What the evidence says once the rows of a fleet are seen together: how many steps each has, and its scatter.
 
-    `kind` (g,): equal for siblings, whose scatter is alike; without it every row keeps its own.
+    `kind` (g,): equal for siblings, whose scatter is alike; without it every row keeps its scatter.
     """
     steps = _steps(e)
-    told = {name: column[np.arange(len(steps)), steps] for name, column in e.told.items()}
-    session, flight, freedom = told["session_variance"], told["flight_variance"], told["freedom"]
+    chosen = {name: column[np.arange(len(steps)), steps] for name, column in e.estimates.items()}
+    session, flight, freedom = chosen["session_variance"], chosen["flight_variance"], chosen["freedom"]
     ratio = np.ones(len(steps))
     if kind is not None:
         claimed = e.mean_variance + flight
@@ -100,31 +99,31 @@ def judge(e: Evidence, kind: np.ndarray | None = None) -> Trends:
         session = np.where(e.enough, np.maximum(moderated - claimed, 0.0), session)
         freedom = np.where(e.enough, lent, freedom)
     wider = np.sqrt(ratio)
-    drift_p = 2.0 * stats.t.sf(np.abs(told["drift_z"] / wider), np.maximum(freedom, LEAST_FREEDOM))
+    drift_p = 2.0 * stats.t.sf(np.abs(chosen["drift_z"] / wider), np.maximum(freedom, LEAST_FREEDOM))
     v = e.last_variance + session + flight
-    line = told["last_line"] * ratio
+    line = chosen["last_line"] * ratio
     spread = np.where(e.last_kept, np.maximum(v - line, LEAST_LEFT * v), v + line)
     several = e.n_sessions >= 2
     return Trends(
         n_flights=e.n_flights,
         n_sessions=e.n_sessions,
-        value=told["value"],
-        sd=told["sd"] * wider,
-        slope_per_degc=told["slope_per_degc"],
-        slope_per_degc_sd=told["slope_per_degc_sd"] * wider,
-        slope_per_day=told["slope_per_day"],
-        slope_per_day_sd=told["slope_per_day_sd"] * wider,
-        best_degc=told["best_degc"],
-        best_day=told["best_day"],
+        value=chosen["value"],
+        sd=chosen["sd"] * wider,
+        slope_per_degc=chosen["slope_per_degc"],
+        slope_per_degc_sd=chosen["slope_per_degc_sd"] * wider,
+        slope_per_day=chosen["slope_per_day"],
+        slope_per_day_sd=chosen["slope_per_day_sd"] * wider,
+        best_degc=chosen["best_degc"],
+        best_day=chosen["best_day"],
         session_sd=np.where(several, e.unit * np.sqrt(session), np.nan),
         flight_sd=np.where(several, e.unit * np.sqrt(flight), np.nan),
-        last_z=np.where(e.enough & e.timed, told["last_error"] / np.sqrt(spread), np.nan),
-        change_day=told["change_day"],
-        change_size=told["change_size"],
-        change_size_sd=told["change_size_sd"],
+        last_z=np.where(e.enough & e.timed, chosen["last_error"] / np.sqrt(spread), np.nan),
+        change_day=chosen["change_day"],
+        change_size=chosen["change_size"],
+        change_size_sd=chosen["change_size_sd"],
         drift_p=np.where(freedom > LEAST_FREEDOM, drift_p, np.nan),
         step_p=np.where(e.enough & e.timed, e.step_p[:, 0], np.nan),
-        moved=told["moved"] / np.sqrt(e.mean_variance + session + flight),
+        moved=chosen["moved"] / np.sqrt(e.mean_variance + session + flight),
         kept=e.kept,
     )
 

@@ -46,7 +46,7 @@ class Prepared:
     """Histories in the coordinates of the regression.
 
     `y`, `variance` (n,): (value − centre)/unit and its s²; `centre`, `unit` (g,). `regressors` (n, 3): 1, then
-    temperature and time as (x − x_centre)/x_width, 0 throughout a row that does not tell the slope; both (g, 3).
+    temperature and time as (x − x_centre)/x_width, 0 throughout a row that does not determine the slope; both (g, 3).
     `usable` (n,): flights with all that the line needs; `keep` (n,): of them those that count. `enough` (g,): rows with
     sessions for a trend; `timed` (g,): rows whose flights have an order in time.
     """
@@ -141,9 +141,9 @@ def _with_all_it_needs(h: Histories, grouping: Grouping) -> np.ndarray:
 
 def _scaled(h: Histories, grouping: Grouping) -> tuple[Array, Array, Array, Array]:
     """(centre (g,), unit (g,), y, s²). A missing sd is the mean of the row's others, else 0."""
-    row, flights, known = h.row, np.bincount(h.row), np.isfinite(h.sd)
-    mean_sd = grouping.by_row(np.where(known, h.sd, 0.0)) / np.maximum(grouping.by_row(known.astype(float)), 1)
-    sd = np.where(known, h.sd, mean_sd[row])
+    row, flights, finite = h.row, np.bincount(h.row), np.isfinite(h.sd)
+    mean_sd = grouping.by_row(np.where(finite, h.sd, 0.0)) / np.maximum(grouping.by_row(finite.astype(float)), 1)
+    sd = np.where(finite, h.sd, mean_sd[row])
     centre = grouping.by_row(h.value) / flights
     unit = np.sqrt(grouping.by_row((h.value - centre[row]) ** 2 + sd**2) / flights)
     unit = np.maximum(unit, np.maximum(1e-12 * np.abs(centre), 1e-300))
@@ -175,8 +175,8 @@ def _alone(h: Histories, grouping: Grouping, usable: np.ndarray, y: Array, varia
     warmth = np.nan_to_num(h.temperature_degc[there])
     slope = temperature_slope(row, y[there], h.temperature_degc[there], grouping.n_rows)
     residual = y[there] - slope[row] * warmth
-    own = variance[there]
-    total = own + scatter_variance(row, residual, own, grouping.n_rows)[row]
+    claimed_variance = variance[there]
+    total = claimed_variance + scatter_variance(row, residual, claimed_variance, grouping.n_rows)[row]
     alone = np.zeros(len(y), dtype=bool)
     alone[there] = isolated(row, residual, total)
     # The same for sessions of several flights, from what is left of them.
@@ -184,7 +184,7 @@ def _alone(h: Histories, grouping: Grouping, usable: np.ndarray, y: Array, varia
     weight = np.bincount(session, good / total, len(grouping.row_of_session))
     present = np.flatnonzero(weight > 0)
     mean = np.bincount(session, good * residual / total, len(weight))[present] / weight[present]
-    claimed = 1.0 / np.bincount(session, good / own, len(weight))[present]
+    claimed = 1.0 / np.bincount(session, good / claimed_variance, len(weight))[present]
     owner = grouping.row_of_session[present]
     between = scatter_variance(owner, mean, claimed, grouping.n_rows)[owner]
     spoiled = np.zeros(len(weight), dtype=bool)

@@ -1,4 +1,4 @@
-"""What the siblings of a unit tell: whether it is unlike them, and how large its scatter can be believed to be."""
+"""Comparison of a unit with its siblings: whether it is unlike them, and a better estimate of its scatter."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ def sibling_distance(
     doubtful : (n,) bool array, optional
         Values that do not serve as siblings to others; they are measured themselves.
     kind : (n,) array, optional
-        Equal for groups of like spread and unit; a group has one kind. Without it every group is its own.
+        Equal for groups of like spread and unit; a group has one kind. Without it every group is compared within
+        itself.
     """
     z, p = np.full(len(value), np.nan), np.ones(len(value))
     inside = np.ones(len(value), dtype=bool) if doubtful is None else ~doubtful
@@ -54,16 +55,16 @@ def sibling_distance(
             good = members[inside[members]]
             if len(good) > ENOUGH_SIBLINGS:
                 inside[good] = ~outliers(value[good], sd[good], REFERENCE_LEVEL)
-        known = [m[inside[m]] for m in groups]
-        freedom = np.array([len(m) - 1.0 for m in known])
-        squares = np.array([float(np.sum((value[m] - value[m].mean()) ** 2)) if len(m) > 1 else 0.0 for m in known])
+        counted = [m[inside[m]] for m in groups]
+        freedom = np.array([len(m) - 1.0 for m in counted])
+        squares = np.array([float(np.sum((value[m] - value[m].mean()) ** 2)) if len(m) > 1 else 0.0 for m in counted])
         for i, members in enumerate(groups):
             lent, others = 0.0, 0.0
             if kind is not None:
                 rest = np.maximum(freedom, 0.0).sum() - max(freedom[i], 0.0)
                 if rest > 0.0:
                     lent, others = (squares.sum() - squares[i]) / rest, 1.0 / (1.0 / LIKE_FREEDOM + 1.0 / rest)
-            k = len(known[i]) - inside[members].astype(float)
+            k = len(counted[i]) - inside[members].astype(float)
             judged = k >= LEAST_SIBLINGS
             if judged.any():
                 t, left = _distances(value[members], sd[members], inside[members], lent, others)
@@ -104,10 +105,10 @@ def _distances(
     """t of each value against the others that are inside, and its degrees of freedom; their variance drawn towards
     `lent`."""
     x = value - np.median(value[inside])
-    own = inside * x
+    inner = inside * x
     k = np.maximum(inside.sum() - inside.astype(float), 1.0)
-    mean = (own.sum() - own) / k
-    s2 = np.maximum((own @ own - own**2) / k - mean**2, 0.0) * k / np.maximum(k - 1.0, 1.0)
+    mean = (inner.sum() - inner) / k
+    s2 = np.maximum((inner @ inner - inner**2) / k - mean**2, 0.0) * k / np.maximum(k - 1.0, 1.0)
     freedom = k - 1.0 + lent_freedom
     s2 = ((k - 1.0) * s2 + lent_freedom * lent) / np.maximum(freedom, 1.0)
     spread = np.sqrt(s2 * (1.0 + 1.0 / k) + sd**2)
@@ -117,10 +118,10 @@ def _distances(
 def moderated_variance(group: np.ndarray, variance: Array, freedom: Array) -> tuple[Array, Array]:
     """(variance, freedom), each (n,), after each variance has been drawn towards its siblings'.
 
-    A variance from few degrees of freedom is itself uncertain; siblings tell what is usual. Theirs are taken as draws
+    A variance from few degrees of freedom is itself uncertain; siblings show what is usual. Theirs are taken as draws
     from a scaled inverse χ² with d0 degrees of freedom about s0², both found from the mean and variance of log s²; then
     s̃² = (d0 s0² + d s²)/(d0 + d), with d0 + d degrees of freedom. Siblings that differ much give a small d0: then each
-    keeps its own. So do groups with fewer than six, and entries that are not finite.
+    is not changed; nor are groups with fewer than six and entries that are not finite.
 
     References
     ----------

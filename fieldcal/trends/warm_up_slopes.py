@@ -16,19 +16,23 @@ DISAGREE_SIGMAS = 3.0
 warm-up's gradients inside the IMU are then part of its slope."""
 
 
-def known_slopes(flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends: Trends) -> tuple[Array, Array] | None:
+def slopes_of_warm_ups(
+    flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends: Trends
+) -> tuple[Array, Array] | None:
     """(slope per °C, sd), each (g,), of the series `zero` and `zero_bias` from flights that warmed up; NaN elsewhere.
 
     `zero_per_degc` is pooled over flights with its scatter. It is the slope of `zero`; of `zero_bias` = −λ (zero − d0)
-    it is −λ times, and the scale's own slope adds λ'/λ zero_bias, of which the usual size is in the sd. None where no
+    it is −λ times, and the slope of the scale adds λ'/λ zero_bias, of which the usual size is in the sd. None where no
     flight warmed up.
     """
-    own = ((flights["method"] == METHOD) & (flights["parameter"] == PARAMETER)).to_numpy()
-    if not own.any():
+    fitted = ((flights["method"] == METHOD) & (flights["parameter"] == PARAMETER)).to_numpy()
+    if not fitted.any():
         return None
-    series, number = np.unique(h.row[own], return_inverse=True)
+    series, number = np.unique(h.row[fitted], return_inverse=True)
     mean, sd = pooled(
-        Histories(number, h.session[own], h.time_day[own], h.temperature_degc[own], h.value[own], h.sd[own])
+        Histories(
+            number, h.session[fitted], h.time_day[fitted], h.temperature_degc[fitted], h.value[fitted], h.sd[fitted]
+        )
     )
     key = ["imu_id", "sensor", "axis"]
     found = rows[series].select(key).with_columns(warm=pl.Series(mean), warm_sd=pl.Series(sd))
