@@ -21,7 +21,7 @@ import numpy as np
 from fieldcal.estimation import ellipsoid, smoothing, wahba
 from fieldcal.estimation.gyroscope import equation_error, output_error
 from fieldcal.estimation.gyroscope.equation_error import GyroFit
-from fieldcal.simulation.experiment import SCALE, Recording, simulate
+from fieldcal.simulation.experiment import SCALE, SimulatedFlight, simulate
 
 REFERENCE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -36,7 +36,7 @@ def best_of_five(function: Callable[[], object]) -> float:
     return min(times)
 
 
-def chain(r: Recording, *, method: str, equations: str, output: bool) -> GyroFit:
+def chain(r: SimulatedFlight, *, method: str, equations: str, output: bool) -> GyroFit:
     """The paper's calibration of one flight: smoothing, both ellipsoids, QUEST, gyroscope."""
     names = ("gyroscope", "accelerometer", "magnetometer")
     logged = np.hstack([r.counts[name] for name in names])

@@ -29,7 +29,7 @@ from fieldcal.estimation.joint.problem import Readings
 from fieldcal.geometry.rotation import angle_between
 from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import settings, signals
-from fieldcal.simulation.experiment import Experiment, Recording, constants_at, simulate
+from fieldcal.simulation.experiment import Experiment, SimulatedFlight, constants_at, simulate
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import AXES, QUATERNION, constants, matrix
@@ -51,7 +51,7 @@ ROW_METHOD = {"serial": {"gyroscope": "output_error"}, "joint": dict.fromkeys(SE
 Figures = dict[str, list[float]]
 
 
-def measure(recording: Recording, method: str, **changes: Any) -> Iterator[tuple[str, float]]:
+def measure(recording: SimulatedFlight, method: str, **changes: Any) -> Iterator[tuple[str, float]]:
     """(quantity, error) of one flight; "refused …" counts. `changes` replace parameters."""
     own = settings(recording.experiment, method=method, lever_arm_m=None, **changes)
     results = run_flight(signals(recording), own)
@@ -93,7 +93,9 @@ def _rows(results: dict[str, StageResult], method: str, name: str) -> pl.DataFra
     return None if rows.is_empty() or (rows["status"] != "ok").any() else rows
 
 
-def _against_vps(recording: Recording, results: dict[str, StageResult], method: str) -> Iterator[tuple[str, float]]:
+def _against_vps(
+    recording: SimulatedFlight, results: dict[str, StageResult], method: str
+) -> Iterator[tuple[str, float]]:
     sync = results["vps_sync"].tables.get("sync")
     if sync is not None and sync["status"][0] == "ok":
         middle = 0.5 * float(recording.t[0] + recording.t[-1])
@@ -156,7 +158,7 @@ def speed() -> None:
         print(f"| {cells} |", flush=True)
 
 
-def _fit_alone(r: Recording, results: dict[str, StageResult] | None) -> JointFit:
+def _fit_alone(r: SimulatedFlight, results: dict[str, StageResult] | None) -> JointFit:
     """Start and fit of a recording, from the serial result where there is one."""
     segment = np.zeros(len(r.t), dtype=np.int64)
     readings = Readings(
@@ -170,7 +172,9 @@ def _fit_alone(r: Recording, results: dict[str, StageResult] | None) -> JointFit
     return fit_joint(*initialise.prepare(readings, _start(r, readings, results)))
 
 
-def _start(r: Recording, readings: Readings, results: dict[str, StageResult] | None) -> dict[str, initialise.Constants]:
+def _start(
+    r: SimulatedFlight, readings: Readings, results: dict[str, StageResult] | None
+) -> dict[str, initialise.Constants]:
     """The serial result where there is one, else the estimator's own start."""
     if results is not None:
         tables = {name: results[SOURCES["serial"][name]].tables["calibration"] for name in SENSORS}

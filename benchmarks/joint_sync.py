@@ -17,7 +17,7 @@ from joint_accuracy import CASES as ALL
 from joint_accuracy import flights_of
 
 from fieldcal.simulation.archive import settings, signals
-from fieldcal.simulation.experiment import Recording, simulate
+from fieldcal.simulation.experiment import SimulatedFlight, simulate
 from fieldcal.stages.pipeline import run_flight
 
 CASES = {
@@ -28,7 +28,7 @@ CASES = {
 }
 
 
-def errors(r: Recording) -> tuple[float, float, float, float] | None:
+def errors(r: SimulatedFlight) -> tuple[float, float, float, float] | None:
     """Lag at mid-flight, s; skew, ppm; both ÷ sd. None where it was refused."""
     results = run_flight(signals(r), settings(r.experiment, method="joint", lever_arm_m=None))
     sync: pl.DataFrame | None = results["vps_sync"].tables.get("sync")

@@ -24,7 +24,7 @@ from fieldcal.estimation.gyroscope.output_error import propagate_stretches, star
 from fieldcal.geometry.rotation import Array, continuous, euler_angles
 from fieldcal.geometry.sensor_model import calibrate
 from fieldcal.simulation.archive import settings, signals
-from fieldcal.simulation.experiment import Experiment, Recording, simulate
+from fieldcal.simulation.experiment import Experiment, SimulatedFlight, simulate
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import QUATERNION, constants, matrix, seconds, triad
@@ -58,7 +58,7 @@ def tic_table(runs: Mapping[str, Results]) -> str:
     return "\n".join(lines)
 
 
-def draw(folder: Path, r: Recording, results: Results, s: FlightSettings) -> list[Path]:
+def draw(folder: Path, r: SimulatedFlight, results: Results, s: FlightSettings) -> list[Path]:
     """Figures 5–10 of the paper, PNG files in `folder`."""
     import matplotlib
 

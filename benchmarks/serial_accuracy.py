@@ -19,7 +19,7 @@ import polars as pl
 from fieldcal.config.parameters import PROFILES
 from fieldcal.geometry.rotation import angle_between
 from fieldcal.simulation.archive import settings, signals, truth
-from fieldcal.simulation.experiment import Experiment, Recording, simulate
+from fieldcal.simulation.experiment import Experiment, SimulatedFlight, simulate
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.tables import AXES, QUATERNION, matrix
 
@@ -40,7 +40,7 @@ class Study:
     attitude_deg: list[float] = field(default_factory=list)
     refused: dict[str, int] = field(default_factory=lambda: dict.fromkeys(WHERE, 0))
 
-    def add(self, recording: Recording, parameters: dict[str, object]) -> None:
+    def add(self, recording: SimulatedFlight, parameters: dict[str, object]) -> None:
         """Calibrate one recording and note its errors; refused estimates are counted, not averaged."""
         results = run_flight(signals(recording), settings(recording.experiment, **parameters))
         known = truth(recording)["constants"]

@@ -62,6 +62,7 @@ __all__ = [
     "Recording",
     "Refused",
     "SensorCalibration",
+    "SimulatedFlight",
     "Synchronisation",
     "Triad",
     "UnreadableLog",
@@ -133,6 +134,7 @@ _NAMES_OF = {
     "simulation.archive": ("write_flights",),
     "simulation.experiment": (
         "Experiment",
+        "SimulatedFlight",
         "simulate",
     ),
     "warehouse.errors": ("WarehouseError",),
@@ -163,7 +165,7 @@ if TYPE_CHECKING:
     from fieldcal.exports.apply import CalibratedReadings
     from fieldcal.exports.calibration import Constants, Export, Triad
     from fieldcal.simulation.archive import write_flights
-    from fieldcal.simulation.experiment import Experiment, simulate
+    from fieldcal.simulation.experiment import Experiment, SimulatedFlight, simulate
     from fieldcal.warehouse.errors import WarehouseError
 else:  # mypy is not shown this: it would let every misspelt name pass
 

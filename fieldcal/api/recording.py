@@ -72,8 +72,8 @@ class Recording:
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     log = fieldcal.write_flights(folder, fieldcal.Experiment(duration_s=20.0))[0]
     ...     recording = fieldcal.read_log(log)
-    >>> recording.verdict, recording.vehicle_id, recording.units["gyroscope"]
-    ('ok', 'sim-1', 'counts')
+    >>> recording.verdict == "ok", recording.vehicle_id, recording.units["gyroscope"]
+    (True, 'sim-1', 'counts')
     >>> t, readings = recording.readings("gyroscope")
     >>> t.shape, readings.shape
     ((3700,), (3700, 3))

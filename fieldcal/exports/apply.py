@@ -58,8 +58,9 @@ class CalibratedReadings:
     ...     log = fieldcal.write_flights(folder, fieldcal.Experiment(duration_s=20.0))[0]
     ...     calibrated = fieldcal.apply(log, fieldcal.calibrate(log))
     ...     written, _ = calibrated.write(f"{folder}/calibrated.mcap")
-    >>> sorted(calibrated.readings), [path.name for path in written]
-    (['accelerometer', 'gyroscope', 'magnetometer'], ['calibrated.mcap'])
+    >>> t_ns, z = calibrated.readings["magnetometer"]
+    >>> z.shape, calibrated.constants.triads["magnetometer"].unit, [path.name for path in written]
+    ((3700, 3), 'norm', ['calibrated.mcap'])
     """
 
     readings: dict[str, tuple[np.ndarray, Array]]

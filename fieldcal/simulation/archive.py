@@ -16,7 +16,7 @@ from fieldcal.config.configuration import parse
 from fieldcal.config.flight_settings import FlightSettings, flight_settings
 from fieldcal.logs.mcap.write import pose_channel, raw_imu_channel, write_mcap
 from fieldcal.names import SENSORS, Sensor
-from fieldcal.simulation.experiment import Experiment, Recording, constants_at, simulate
+from fieldcal.simulation.experiment import Experiment, SimulatedFlight, constants_at, simulate
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, triad
 
 FIRST_FLIGHT = datetime(2026, 1, 12, 8, 0, tzinfo=UTC)
@@ -117,7 +117,7 @@ def _vehicle_table(vehicle_id: str, e: Experiment) -> str:
     return "\n".join(lines)
 
 
-def write_flight(folder: Path, name: str, r: Recording, start: datetime, *, log_format: str = "mcap") -> Path:
+def write_flight(folder: Path, name: str, r: SimulatedFlight, start: datetime, *, log_format: str = "mcap") -> Path:
     """Write one recording and its truth; returns the log (a file, or a folder of CSVs)."""
     start_ns = int(start.timestamp()) * 1_000_000_000
     t_ns = start_ns + np.rint(r.t * 1e9).astype(np.int64)
@@ -140,7 +140,7 @@ def write_flight(folder: Path, name: str, r: Recording, start: datetime, *, log_
     return log
 
 
-def signals(r: Recording) -> dict[str, pl.DataFrame]:
+def signals(r: SimulatedFlight) -> dict[str, pl.DataFrame]:
     """The recording as signal tables, as if its log had been read; stamps from 0."""
     t_ns = np.rint(r.t * 1e9).astype(np.int64)
     imu = np.hstack([r.counts[Sensor.GYROSCOPE], r.counts[Sensor.ACCELEROMETER]])
@@ -164,7 +164,7 @@ def settings(e: Experiment, vehicle_id: str = "sim-1", **changes: object) -> Fli
     return flight_settings(vehicle, units=dict.fromkeys(SENSORS, "counts")).changed(**changes)
 
 
-def _write_mcap(path: Path, r: Recording, t_ns: np.ndarray, vps_ns: np.ndarray, start_ns: int) -> None:
+def _write_mcap(path: Path, r: SimulatedFlight, t_ns: np.ndarray, vps_ns: np.ndarray, start_ns: int) -> None:
     """Raw counts and VPS poses as ROS 2 messages; log times are the recorder's, stamps each device's own."""
     counts = {k: v.astype(np.uint16) if r.experiment.quantisation else v for k, v in r.counts.items()}
     channels = [
@@ -186,7 +186,7 @@ def _write_mcap(path: Path, r: Recording, t_ns: np.ndarray, vps_ns: np.ndarray, 
     write_mcap(path, channels, metadata={**units, "world": "ned", "body": "frd", "gravity_sign": "gravity"})
 
 
-def _write_csv(folder: Path, r: Recording) -> None:
+def _write_csv(folder: Path, r: SimulatedFlight) -> None:
     """imu.csv and vps.csv under the default column names, time in seconds from the start, every digit that counts."""
     kind = pl.UInt16 if r.experiment.quantisation else pl.Float64
     names = {Sensor.GYROSCOPE: "g", Sensor.ACCELEROMETER: "a", Sensor.MAGNETOMETER: "m"}
@@ -228,7 +228,7 @@ class Truth(TypedDict):
     seed: int
 
 
-def truth(r: Recording) -> Truth:
+def truth(r: SimulatedFlight) -> Truth:
     """What a calibration of this recording should find, plain JSON."""
     temperature = float(np.mean(r.temperature))
     constants: dict[str, TriadTruth] = {}

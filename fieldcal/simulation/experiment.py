@@ -85,13 +85,19 @@ class Experiment:
 
 
 @dataclass(frozen=True)
-class Recording:
+class SimulatedFlight:
     """A simulated log and its truth.
 
     Logged: `t` (n,) IMU stamps, s; `counts` sensor → (n, 3); `temperature` (n,) °C; `vps_t` (m,) s on the VPS clock;
     `vps_q` (m, 4) body to NED world; `vps_position` (m, 3) m.
     Truth: `q` (n, 4) and `rate` (n, 3) at t as the sensors saw them, i.e. `delay_s` late by the sensor filter; the two
     constant VPS rotations.
+
+    Examples
+    --------
+    >>> flight = simulate(seed=1, duration_s=20.0)
+    >>> flight.t.shape, flight.vps_q.shape, sorted(flight.experiment.scale) == sorted(flight.counts)
+    ((3700,), (7000, 4), True)
     """
 
     experiment: Experiment
@@ -210,7 +216,7 @@ def _sinusoids(
     return amplitude, omega, rng.uniform(0, 2 * np.pi, size=(3, lines))
 
 
-def simulate(experiment: Experiment | None = None, **changes: object) -> Recording:
+def simulate(experiment: Experiment | None = None, **changes: object) -> SimulatedFlight:
     """Fly one experiment in memory: arrays of what is logged, and the truth.
 
     Parameters
@@ -222,7 +228,7 @@ def simulate(experiment: Experiment | None = None, **changes: object) -> Recordi
 
     Returns
     -------
-    Recording
+    SimulatedFlight
         `t` (n,) s, `counts` (sensor → (n, 3)), `vps_t`, `vps_q`, …, and the truth beside them.
 
     Raises
@@ -261,7 +267,7 @@ def simulate(experiment: Experiment | None = None, **changes: object) -> Recordi
         from_rotation_vector(e.vps_misalignment_rad * _unit(streams["vps"])),
     )
     vps_t, vps_q, vps_position = _vps(e, motion, streams["vps"], world, body)
-    return Recording(
+    return SimulatedFlight(
         experiment=e,
         t=t,
         counts=counts,

@@ -15,15 +15,15 @@ STILL = np.ones((500, 3))
 
 
 @pytest.fixture(scope="module")
-def flight() -> fieldcal.simulation.experiment.Recording:
+def flight() -> fieldcal.SimulatedFlight:
     return fieldcal.simulate(seed=7)
 
 
-def true_scale(flight: fieldcal.simulation.experiment.Recording, name: str) -> np.ndarray:
+def true_scale(flight: fieldcal.SimulatedFlight, name: str) -> np.ndarray:
     return np.asarray(constants_at(flight.experiment, name, 25.0)[0])
 
 
-def test_ellipsoid(flight: fieldcal.simulation.experiment.Recording) -> None:
+def test_ellipsoid(flight: fieldcal.SimulatedFlight) -> None:
     logged = flight.counts["magnetometer"]
     fit = fieldcal.fit_ellipsoid(logged, 1.0, polarity=SIGNS["magnetometer"])
     error = fit.scale_diagonal - true_scale(flight, "magnetometer")
@@ -32,7 +32,7 @@ def test_ellipsoid(flight: fieldcal.simulation.experiment.Recording) -> None:
     assert np.abs(np.linalg.norm(fit.apply(logged), axis=1) - 1.0).max() < 0.05
 
 
-def test_an_ellipsoid_that_is_not_determined_is_refused(flight: fieldcal.simulation.experiment.Recording) -> None:
+def test_an_ellipsoid_that_is_not_determined_is_refused(flight: fieldcal.SimulatedFlight) -> None:
     logged = flight.counts["magnetometer"]
     with pytest.raises(fieldcal.UnusableFlight) as told:
         fieldcal.fit_ellipsoid(logged, 1.0, max_scale_sd=1e-4)
@@ -42,7 +42,7 @@ def test_an_ellipsoid_that_is_not_determined_is_refused(flight: fieldcal.simulat
         fieldcal.fit_ellipsoid(np.full((20, 3), np.nan), 1.0)
 
 
-def test_output_error(flight: fieldcal.simulation.experiment.Recording) -> None:
+def test_output_error(flight: fieldcal.SimulatedFlight) -> None:
     fit = fieldcal.fit_output_error(flight.t, flight.q, flight.counts["gyroscope"])
     error = fit.scale - true_scale(flight, "gyroscope")
     assert (np.abs(error) < FARTHEST * fit.scale_sd).all()
@@ -53,7 +53,7 @@ def test_output_error(flight: fieldcal.simulation.experiment.Recording) -> None:
     assert again.scale == pytest.approx(fit.scale, rel=1e-3)
 
 
-def test_output_error_refuses_what_did_not_turn(flight: fieldcal.simulation.experiment.Recording) -> None:
+def test_output_error_refuses_what_did_not_turn(flight: fieldcal.SimulatedFlight) -> None:
     n = len(STILL)
     with pytest.raises(fieldcal.UnusableFlight, match="stuck, or never turned"):
         fieldcal.fit_output_error(flight.t[:n], flight.q[:n], STILL)
@@ -64,7 +64,7 @@ def test_output_error_refuses_what_did_not_turn(flight: fieldcal.simulation.expe
         fieldcal.fit_output_error(flight.t, flight.q[:, :3], flight.counts["gyroscope"])
 
 
-def test_joint(flight: fieldcal.simulation.experiment.Recording) -> None:
+def test_joint(flight: fieldcal.SimulatedFlight) -> None:
     joint = fieldcal.fit_joint(flight.t, **flight.counts, gravity_mps2=9.81, polarity=SIGNS)
     for name in SIGNS:
         scale = getattr(joint, name).scale
@@ -75,7 +75,7 @@ def test_joint(flight: fieldcal.simulation.experiment.Recording) -> None:
 
 
 def test_joint_refuses_by_axis_and_leaves_out_what_it_is_not_given(
-    flight: fieldcal.simulation.experiment.Recording,
+    flight: fieldcal.SimulatedFlight,
 ) -> None:
     start = {"gyroscope": constants_at(flight.experiment, "gyroscope", 25.0)}
     joint = fieldcal.fit_joint(
@@ -98,7 +98,7 @@ def test_joint_refuses_by_axis_and_leaves_out_what_it_is_not_given(
 
 
 @pytest.mark.parametrize("with_magnetometer", [False, True])
-def test_clocks(flight: fieldcal.simulation.experiment.Recording, with_magnetometer: bool) -> None:
+def test_clocks(flight: fieldcal.SimulatedFlight, with_magnetometer: bool) -> None:
     q = flight.vps_q.copy()
     q[[100, 2000, 2001]] = [0.5, 0.5, 0.5, 0.5]  # outliers are left out
     sync = fieldcal.synchronise(

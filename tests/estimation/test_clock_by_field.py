@@ -8,7 +8,7 @@ from numerics_support import rms
 
 from fieldcal.estimation.clock_sync import by_rates
 from fieldcal.estimation.clock_sync.by_field import FieldClock, refine_by_field
-from fieldcal.simulation.experiment import Recording, simulate
+from fieldcal.simulation.experiment import SimulatedFlight, simulate
 
 MOVING = {"translation_rms_mps2": 0.3, "vps_skew_ppm": 200.0, "vps_misalignment_rad": 0.1}
 # Left over without noise: SLERP between VPS samples and the 0.03 s slope.
@@ -16,14 +16,16 @@ FLOOR_S, FLOOR_PPM = 5e-6, 1.0
 HONEST = 0.7, 1.4  # rms of error ÷ sd over 10 flights, 20 numbers: two and a half of its own standard deviations
 
 
-def gyro_clock(r: Recording) -> tuple[by_rates.SyncFit, np.ndarray, np.ndarray]:
+def gyro_clock(r: SimulatedFlight) -> tuple[by_rates.SyncFit, np.ndarray, np.ndarray]:
     keep = by_rates.mask_outliers(r.vps_t, r.vps_q)
     t, q = r.vps_t[keep], r.vps_q[keep]
     gyro = r.counts["gyroscope"] - np.median(r.counts["gyroscope"], axis=0)
     return by_rates.synchronise(r.t, gyro, t, q), t, q
 
 
-def both(r: Recording, magnetometer: np.ndarray | None = None) -> tuple[by_rates.SyncFit, by_rates.SyncFit, FieldClock]:
+def both(
+    r: SimulatedFlight, magnetometer: np.ndarray | None = None
+) -> tuple[by_rates.SyncFit, by_rates.SyncFit, FieldClock]:
     fit, t, q = gyro_clock(r)
     logged = r.counts["magnetometer"] if magnetometer is None else magnetometer
     refined, own = refine_by_field(r.t, logged, t, q, fit)

@@ -11,6 +11,7 @@ import polars as pl
 import pytest
 from logs_support import EPOCH_NS, messages_by_mcap_ros2
 
+import fieldcal
 from fieldcal.errors import FieldcalError
 from fieldcal.exports import apply
 from fieldcal.exports.calibration import Constants, Triad
@@ -73,26 +74,20 @@ MAG = magnetic_field_channel(T_NS[::2], None, FIELD[::2])
 WARM = temperature_channel(WARM_T_NS, None, degc(WARM_T_NS))
 
 
-@pytest.fixture
-def flown_with(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Lets `apply` find these constants in the warehouse."""
-
-    def give(*sensors: Sensor, **changes: Any) -> Constants:
-        constants = Constants("v", "i", {s: constant(s, **changes) for s in sensors or Sensor}, "2026")
-        monkeypatch.setattr(apply, "constants_of", lambda root, vehicle_id, at: constants)
-        return constants
-
-    return give
+def flown_with(*sensors: Sensor, **changes: Any) -> Constants:
+    return Constants("v", "i", {s: constant(s, **changes) for s in sensors or Sensor}, "2026")
 
 
-def calibrated(log: Path, at: float | None = None, config: Path | None = None) -> apply.Calibrated:
-    return apply.apply_constants(log, log.parent, config, None, at)
+def calibrated(
+    log: Path, constants: Constants, *, follow_temperature: bool = True, config: Path | None = None
+) -> apply.CalibratedReadings:
+    return fieldcal.apply(log, constants, follow_temperature=follow_temperature, config=config)
 
 
-def test_every_sample_at_its_own_temperature(flown_with: Any, tmp_path: Path) -> None:
+def test_every_sample_at_its_own_temperature(tmp_path: Path) -> None:
     """Temperatures lie ten times as far apart as readings and do not begin with them: a straight line between them."""
     constants = flown_with()
-    found = calibrated(log_of(tmp_path, IMU, MAG, WARM)).readings
+    found = calibrated(log_of(tmp_path, IMU, MAG, WARM), constants).readings
     for sensor, t_ns, logged in (
         (Sensor.GYROSCOPE, T_NS, RATE),
         (Sensor.ACCELEROMETER, T_NS, FORCE),
@@ -103,21 +98,21 @@ def test_every_sample_at_its_own_temperature(flown_with: Any, tmp_path: Path) ->
         np.testing.assert_allclose(found[sensor][1], wanted, rtol=0, atol=EQUAL)
 
 
-def test_outside_the_temperatures_the_nearest_one_counts(flown_with: Any, tmp_path: Path) -> None:
+def test_outside_the_temperatures_the_nearest_one_counts(tmp_path: Path) -> None:
     constants = flown_with()
     late = WARM_T_NS + 1_000_000_000
     warm = temperature_channel(late, None, degc(late))
-    found = calibrated(log_of(tmp_path, IMU, warm)).readings[Sensor.GYROSCOPE][1]
+    found = calibrated(log_of(tmp_path, IMU, warm), constants).readings[Sensor.GYROSCOPE][1]
     wanted = by_hand(constants.triads[Sensor.GYROSCOPE], RATE, degc(np.maximum(T_NS, late[0])))
     np.testing.assert_allclose(found, wanted, rtol=0, atol=EQUAL)
 
 
-@pytest.mark.parametrize(("channels", "at"), [((IMU,), None), ((IMU, WARM), 25.0)])
-def test_constants_as_they_are_without_temperatures_or_at_one_that_is_given(
-    flown_with: Any, tmp_path: Path, channels: tuple[MessageChannel, ...], at: float | None
+@pytest.mark.parametrize(("channels", "follow"), [((IMU,), True), ((IMU, WARM), False)])
+def test_constants_as_they_are_without_temperatures_or_where_they_are_not_followed(
+    tmp_path: Path, channels: tuple[MessageChannel, ...], follow: bool
 ) -> None:
     constants = flown_with()
-    found = calibrated(log_of(tmp_path, *channels), at)
+    found = calibrated(log_of(tmp_path, *channels), constants, follow_temperature=follow)
     wanted = by_hand(constants.triads[Sensor.GYROSCOPE], RATE, 25.0)
     np.testing.assert_allclose(found.readings[Sensor.GYROSCOPE][1], wanted, rtol=0, atol=EQUAL)
     assert found.warnings == ()
@@ -134,49 +129,45 @@ def test_constants_as_they_are_without_temperatures_or_at_one_that_is_given(
     ],
 )
 def test_colder_or_warmer_than_flown_is_told(
-    flown_with: Any, tmp_path: Path, flown: tuple[float, float] | None, told: str | None
+    tmp_path: Path, flown: tuple[float, float] | None, told: str | None
 ) -> None:
     """The log's temperatures are 20 to 32 °C."""
-    flown_with(flown_degc=flown)
-    warnings = calibrated(log_of(tmp_path, IMU, WARM)).warnings
+    constants = flown_with(flown_degc=flown)
+    warnings = calibrated(log_of(tmp_path, IMU, WARM), constants).warnings
     assert [w.split(": ")[1].rstrip(".") for w in warnings] == ([told, told] if told else [])
-    assert calibrated(log_of(tmp_path, IMU, WARM), 90.0).warnings == ()
+    assert calibrated(log_of(tmp_path, IMU, WARM), constants, follow_temperature=False).warnings == ()
 
 
-def test_sensors_without_constants_or_readings_are_left_out(flown_with: Any, tmp_path: Path) -> None:
-    flown_with(Sensor.ACCELEROMETER, Sensor.MAGNETOMETER)
-    found = calibrated(log_of(tmp_path, IMU))
+def test_sensors_without_constants_or_readings_are_left_out(tmp_path: Path) -> None:
+    found = calibrated(log_of(tmp_path, IMU), flown_with(Sensor.ACCELEROMETER, Sensor.MAGNETOMETER))
     assert list(found.readings) == [Sensor.ACCELEROMETER]
     assert found.warnings == ("gyroscope: no constants, so it is left out.",)
-    flown_with(Sensor.MAGNETOMETER)
     with pytest.raises(FieldcalError, match="no sensor of this log has constants") as caught:
-        calibrated(log_of(tmp_path, IMU))
+        calibrated(log_of(tmp_path, IMU), flown_with(Sensor.MAGNETOMETER))
     assert caught.value.reason_code == "no_calibration"
-    flown_with(logged_unit="counts")
     with pytest.raises(FieldcalError, match="gyroscope is in rad/s, the constants are for counts") as caught:
-        calibrated(log_of(tmp_path, IMU))
+        calibrated(log_of(tmp_path, IMU), flown_with(logged_unit="counts"))
     assert caught.value.reason_code == "unit_mismatch"
 
 
-def test_the_archives_own_configuration_counts_unless_another_is_given(flown_with: Any, tmp_path: Path) -> None:
-    flown_with()
+def test_the_archives_own_configuration_counts_unless_another_is_given(tmp_path: Path) -> None:
     log = log_of(tmp_path, IMU)
     (tmp_path / "archive" / "fieldcal.toml").write_text('[vehicles.v.units]\ngyroscope = "deg/s"\n')
     other = tmp_path / "other.toml"
     other.write_text('[vehicles.v.units]\ngyroscope = "rad/s"\n')
     with pytest.raises(FieldcalError, match="gyroscope is in deg/s"):
-        calibrated(log)
-    assert Sensor.GYROSCOPE in calibrated(log, config=other).readings
+        calibrated(log, flown_with())
+    assert Sensor.GYROSCOPE in calibrated(log, flown_with(), config=other).readings
 
 
-def test_an_absent_sensor_is_null_in_parquet_and_marked_in_ros(flown_with: Any, tmp_path: Path) -> None:
+def test_an_absent_sensor_is_null_in_parquet_and_marked_in_ros(tmp_path: Path) -> None:
     """Folders are made, and made again; REP-103 has x forward, y left, z up, the log says it is so already."""
     for sensor, other in (
         (Sensor.GYROSCOPE, Sensor.ACCELEROMETER),
         (Sensor.ACCELEROMETER, Sensor.GYROSCOPE),
     ):
         constants = flown_with(sensor)
-        found = calibrated(log_of(tmp_path, IMU))
+        found = calibrated(log_of(tmp_path, IMU), constants)
         for _ in range(2):
             (path,) = apply.write_parquet(found, tmp_path / "deep" / "er" / sensor)
         frame = pl.read_parquet(path)
@@ -204,10 +195,9 @@ def test_an_absent_sensor_is_null_in_parquet_and_marked_in_ros(flown_with: Any, 
     ],
 )
 def test_only_what_the_log_holds_is_written(
-    flown_with: Any, tmp_path: Path, sensors: tuple[Sensor, ...], channels: tuple[MessageChannel, ...], topics: set[str]
+    tmp_path: Path, sensors: tuple[Sensor, ...], channels: tuple[MessageChannel, ...], topics: set[str]
 ) -> None:
-    flown_with(*sensors)
-    found = calibrated(log_of(tmp_path, *channels))
+    found = calibrated(log_of(tmp_path, *channels), flown_with(*sensors))
     path = tmp_path / "out.mcap"
     apply.write_ros(found, path)
     rows = {"/imu/data": SAMPLES, "/imu/mag": SAMPLES // 2, "/imu/temperature": len(WARM_T_NS)}

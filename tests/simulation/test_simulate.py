@@ -27,7 +27,7 @@ from fieldcal.simulation.experiment import (
     VPS_VARIANCE,
     Experiment,
     Motion,
-    Recording,
+    SimulatedFlight,
     constants_at,
     simulate,
 )
@@ -38,35 +38,35 @@ GROUP_DELAY_RIPPLE = 1e-5  # share of a signal below 1 Hz that a 50 Hz filter do
 ROUNDING = 1e-9
 
 
-def sensed(r: Recording, sensor: str) -> np.ndarray:
+def sensed(r: SimulatedFlight, sensor: str) -> np.ndarray:
     """True values of a sensor in SI (or norm): Eq. 5 with the true constants."""
     return r.counts[sensor] * np.array(SCALE[sensor]) + np.array(BIAS[sensor])
 
 
-def motion_of(r: Recording) -> Motion:
+def motion_of(r: SimulatedFlight) -> Motion:
     return Motion(r.experiment, np.random.default_rng(np.random.SeedSequence(r.experiment.seed).spawn(6)[0]))
 
 
 @pytest.fixture(scope="module")
-def paper() -> Recording:
+def paper() -> SimulatedFlight:
     return simulate(seed=1)
 
 
 @pytest.fixture(scope="module")
-def filtered() -> Recording:
+def filtered() -> SimulatedFlight:
     """The same flight without noise and quantisation, but behind the sensors' filter."""
     return simulate(seed=1, noise=False, quantisation=False)
 
 
 @pytest.fixture(scope="module")
-def bare() -> Recording:
+def bare() -> SimulatedFlight:
     return simulate(seed=1, **BARE)
 
 
 # what is sensed ------------------------------------------------------------------------------------------------------
 
 
-def test_the_motion_is_the_papers(paper: Recording) -> None:
+def test_the_motion_is_the_papers(paper: SimulatedFlight) -> None:
     """Nine doublets of 2.2–3.0 s and 0.7–1.1 rad on one axis each, 12 % on the others, tremor of 0.01 rad."""
     motion = motion_of(paper)
     assert motion.amplitudes.shape == (9, 3)
@@ -86,7 +86,7 @@ def test_the_motion_is_the_papers(paper: Recording) -> None:
     )
 
 
-def test_rates_are_the_derivative_of_the_attitude(bare: Recording) -> None:
+def test_rates_are_the_derivative_of_the_attitude(bare: SimulatedFlight) -> None:
     motion, t, h = motion_of(bare), np.arange(3.0, 37.0, 0.05), 1e-5
     turned = to_rotation_vector(multiply(conjugate(motion.attitude(t - h)), motion.attitude(t + h))) / (2 * h)
     np.testing.assert_allclose(motion.rate(t), turned, atol=1e-6)
@@ -109,7 +109,7 @@ def test_position_is_the_acceleration_integrated_twice() -> None:
     np.testing.assert_allclose(second, motion.acceleration(t), atol=1e-4)
 
 
-def test_bare_readings_are_exact(bare: Recording) -> None:
+def test_bare_readings_are_exact(bare: SimulatedFlight) -> None:
     """No noise, no converter, no filter: field, gravity and rate in the body at the stamps."""
     body = Rotation.from_quat(bare.q).inv()
     np.testing.assert_allclose(sensed(bare, "magnetometer"), body.apply([1.0, 0.0, 0.0]), atol=ROUNDING)
@@ -125,7 +125,7 @@ def test_dip_turns_the_field_down() -> None:
     np.testing.assert_allclose(field, np.tile([np.cos(1.1), 0.0, np.sin(1.1)], (len(r.t), 1)), atol=ROUNDING)
 
 
-def test_truth_is_delayed_by_the_sensors_filter(filtered: Recording) -> None:
+def test_truth_is_delayed_by_the_sensors_filter(filtered: SimulatedFlight) -> None:
     """A two-pole 50 Hz filter of damping √½ delays slow motion by 2ζ/ω = 4.5 ms."""
     assert filtered.delay_s == pytest.approx(FILTER_DELAY_S)
     assert pytest.approx(4.5e-3, abs=5e-5) == FILTER_DELAY_S
@@ -138,7 +138,9 @@ def test_truth_is_delayed_by_the_sensors_filter(filtered: Recording) -> None:
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_noise_has_table_1s_variance_after_the_filter(paper: Recording, filtered: Recording, sensor: str) -> None:
+def test_noise_has_table_1s_variance_after_the_filter(
+    paper: SimulatedFlight, filtered: SimulatedFlight, sensor: str
+) -> None:
     noise = (paper.counts[sensor] - filtered.counts[sensor]) * np.array(SCALE[sensor])
     assert noise.var() == pytest.approx(NOISE_VARIANCE[sensor], rel=0.05)
     assert np.abs(noise.mean(axis=0)).max() < 0.05 * np.sqrt(NOISE_VARIANCE[sensor])
@@ -146,7 +148,7 @@ def test_noise_has_table_1s_variance_after_the_filter(paper: Recording, filtered
     assert lagged == pytest.approx(0.39, abs=0.04)  # e^{-x}(cos x + sin x), x = √½ ω Δt: Butterworth noise of 50 Hz
 
 
-def test_words_are_16_bit(paper: Recording) -> None:
+def test_words_are_16_bit(paper: SimulatedFlight) -> None:
     for sensor in SENSORS:
         counts = paper.counts[sensor]
         np.testing.assert_array_equal(counts, np.rint(counts))
@@ -157,7 +159,7 @@ def test_words_are_16_bit(paper: Recording) -> None:
     assert wild.counts["gyroscope"].max() == 65535
 
 
-def test_stamps_are_ticks_of_the_oscillator(paper: Recording, bare: Recording) -> None:
+def test_stamps_are_ticks_of_the_oscillator(paper: SimulatedFlight, bare: SimulatedFlight) -> None:
     np.testing.assert_allclose(paper.t / TICK_S, np.rint(paper.t / TICK_S), atol=1e-6)
     assert len(paper.t) == 7400
     assert np.abs(np.diff(bare.t) - 1 / 185).max() < 1e-12
@@ -182,7 +184,7 @@ def test_translation_has_the_rms_asked_for_below_2_hz() -> None:
     assert np.ptp(lengths) < 0.06
 
 
-def test_a_lever_arm_adds_what_rotation_makes_of_it(bare: Recording) -> None:
+def test_a_lever_arm_adds_what_rotation_makes_of_it(bare: SimulatedFlight) -> None:
     arm = np.array([0.05, 0.02, -0.03])
     r = simulate(seed=1, lever_arm_m=tuple(arm), **BARE)
     motion, h = motion_of(bare), 1e-4
@@ -222,7 +224,7 @@ def test_gyroscope_random_walk() -> None:
     assert rms(np.concatenate(steps)) == pytest.approx(0.01, rel=0.15)
 
 
-def test_losses_and_jitter(paper: Recording) -> None:
+def test_losses_and_jitter(paper: SimulatedFlight) -> None:
     lost = simulate(seed=1, lost_share=0.05, vps=False)
     assert 1 - len(lost.t) / len(paper.t) == pytest.approx(0.05, abs=0.01)
     kept = np.isin(np.rint(paper.t / TICK_S), np.rint(lost.t / TICK_S))
@@ -244,7 +246,7 @@ def test_magnetic_bursts_reach_their_size_and_pass() -> None:
 # VPS -----------------------------------------------------------------------------------------------------------------
 
 
-def vps_error(r: Recording) -> np.ndarray:
+def vps_error(r: SimulatedFlight) -> np.ndarray:
     """Rotation vectors (m, 3), rad, from the true attitude in the VPS's frames to what it says."""
     e = r.experiment
     true = motion_of(r).attitude((r.vps_t - e.vps_offset_s) / (1 + 1e-6 * e.vps_skew_ppm))
@@ -252,7 +254,7 @@ def vps_error(r: Recording) -> np.ndarray:
     return to_rotation_vector(multiply(conjugate(shown), r.vps_q))
 
 
-def test_vps_noise_rate_and_clock(paper: Recording) -> None:
+def test_vps_noise_rate_and_clock(paper: SimulatedFlight) -> None:
     assert len(paper.vps_t) == 40 * 350
     assert vps_error(paper).var() == pytest.approx(VPS_VARIANCE, rel=0.03)
     assert np.diff(paper.vps_t).mean() == pytest.approx((1 + 20e-6) / 350.0, rel=1e-9)
@@ -276,7 +278,7 @@ def test_misalignment_is_two_rotations_of_the_size_asked_for() -> None:
     assert rms(vps_error(r)) < 1.1 * np.sqrt(VPS_VARIANCE)
 
 
-def test_dropouts_and_outliers(paper: Recording) -> None:
+def test_dropouts_and_outliers(paper: SimulatedFlight) -> None:
     gappy = simulate(seed=1, vps_dropout_share=0.1)
     assert 1 - len(gappy.vps_t) / len(paper.vps_t) == pytest.approx(0.1, abs=0.02)
     gaps = np.diff(gappy.vps_t)
@@ -291,7 +293,7 @@ def test_dropouts_and_outliers(paper: Recording) -> None:
 # seeds ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_seed_is_a_flight(paper: Recording) -> None:
+def test_a_seed_is_a_flight(paper: SimulatedFlight) -> None:
     again, other = simulate(seed=1), simulate(seed=2)
     for name in ("t", "q", "rate", "vps_t", "vps_q", "vps_position"):
         np.testing.assert_array_equal(getattr(again, name), getattr(paper, name))
@@ -318,7 +320,7 @@ def test_a_seed_is_a_flight(paper: Recording) -> None:
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
 def test_switching_one_effect_leaves_the_others_draws(
-    paper: Recording, change: dict[str, Any], touches: tuple[str, ...]
+    paper: SimulatedFlight, change: dict[str, Any], touches: tuple[str, ...]
 ) -> None:
     """10 s of it: the readings that the effect does not touch are the same, bit by bit."""
     short = {"seed": 1, "duration_s": 10.0}

@@ -16,7 +16,7 @@ from fieldcal.config.flight_settings import FlightSettings, flight_settings
 from fieldcal.config.parameters import PROFILES
 from fieldcal.config.stage_settings import StageSettings
 from fieldcal.simulation.archive import settings, signals
-from fieldcal.simulation.experiment import SENSORS, Recording, simulate
+from fieldcal.simulation.experiment import SENSORS, SimulatedFlight, simulate
 from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.stage import Stage, run_stage
@@ -78,7 +78,7 @@ def fly(tables: Mapping[str, pl.DataFrame], chosen: FlightSettings) -> dict[str,
     return asked
 
 
-def in_si(recording: Recording, field: str = "") -> tuple[dict[str, pl.DataFrame], FlightSettings]:
+def in_si(recording: SimulatedFlight, field: str = "") -> tuple[dict[str, pl.DataFrame], FlightSettings]:
     """The same flight logged in physical units, and its settings; the field is of unknown strength unless given."""
     e = recording.experiment
     counts = {n: recording.counts[n] * np.array(e.scale[n]) + np.array(e.bias[n]) for n in SENSORS}

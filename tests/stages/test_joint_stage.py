@@ -10,7 +10,7 @@ import pytest
 
 from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import settings, signals, truth
-from fieldcal.simulation.experiment import Recording, simulate
+from fieldcal.simulation.experiment import SimulatedFlight, simulate
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
 
@@ -18,12 +18,12 @@ from fieldcal.stages.results import StageResult
 LAG_S = 0.4e-3
 
 
-def flown(r: Recording, **changes: Any) -> dict[str, StageResult]:
+def flown(r: SimulatedFlight, **changes: Any) -> dict[str, StageResult]:
     return run_flight(signals(r), settings(r.experiment, method="joint", lever_arm_m=None, **changes))
 
 
 @pytest.fixture(scope="module")
-def moving() -> tuple[Recording, dict[str, StageResult]]:
+def moving() -> tuple[SimulatedFlight, dict[str, StageResult]]:
     """A flight that the serial chain refuses: 0.3 m/s² of translation on raw counts."""
     r = simulate(
         seed=31,
@@ -44,7 +44,7 @@ def test_serial_leaves_the_joint_stage_absent() -> None:
     assert not results["joint"].tables
 
 
-def test_all_parameters_of_all_sensors_are_written(moving: tuple[Recording, dict[str, StageResult]]) -> None:
+def test_all_parameters_of_all_sensors_are_written(moving: tuple[SimulatedFlight, dict[str, StageResult]]) -> None:
     r, results = moving
     assert results["accelerometer_pass2"].status == "refused"
     rows = results["joint"].tables["calibration"]
@@ -57,7 +57,9 @@ def test_all_parameters_of_all_sensors_are_written(moving: tuple[Recording, dict
         assert np.abs(value / known[name]["scale"] - 1.0).max() < 0.05, name
 
 
-def test_vps_is_synchronised_by_gyroscope_and_magnetometer(moving: tuple[Recording, dict[str, StageResult]]) -> None:
+def test_vps_is_synchronised_by_gyroscope_and_magnetometer(
+    moving: tuple[SimulatedFlight, dict[str, StageResult]],
+) -> None:
     r, results = moving
     e = r.experiment
     sync = results["vps_sync"].tables["sync"].row(0, named=True)
@@ -68,7 +70,7 @@ def test_vps_is_synchronised_by_gyroscope_and_magnetometer(moving: tuple[Recordi
     assert results["vps_sync"].measured["synchronised_by"] == "gyroscope and magnetometer"
 
 
-def test_the_rest_of_the_flight_is_predicted(moving: tuple[Recording, dict[str, StageResult]]) -> None:
+def test_the_rest_of_the_flight_is_predicted(moving: tuple[SimulatedFlight, dict[str, StageResult]]) -> None:
     _, results = moving
     fit = results["verify"].tables["fit"]
     held_out = fit.filter(pl.col("sample") == "held_out")

@@ -26,7 +26,7 @@ from fieldcal.geometry.rotation import (
 )
 from fieldcal.logs import find_logs, read_log
 from fieldcal.simulation.archive import settings, signals, truth, write_flights
-from fieldcal.simulation.experiment import Experiment, Recording, simulate
+from fieldcal.simulation.experiment import Experiment, SimulatedFlight, simulate
 from fieldcal.stages.pipeline import PIPELINE, run_flight
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, matrix, triad
@@ -53,12 +53,12 @@ def values(results: dict[str, StageResult], sensor: str, parameter: str = "scale
     return np.array([found.get(axis, np.nan) for axis in AXES])
 
 
-def run(recording: Recording, **changes: Any) -> dict[str, StageResult]:
+def run(recording: SimulatedFlight, **changes: Any) -> dict[str, StageResult]:
     return run_flight(signals(recording), settings(recording.experiment, **changes))
 
 
 @pytest.fixture(scope="module")
-def flight() -> Recording:
+def flight() -> SimulatedFlight:
     return simulate(seed=1001)
 
 
@@ -98,7 +98,7 @@ def test_the_bars_over_flights_and_the_papers_method_behind() -> None:
     + [{"equations": "scalar"}, PROFILES["paper"]],
     ids=lambda c: "-".join(str(v) for v in c.values())[:30],
 )
-def test_every_choice_runs_to_the_end(flight: Recording, changes: dict[str, Any]) -> None:
+def test_every_choice_runs_to_the_end(flight: SimulatedFlight, changes: dict[str, Any]) -> None:
     results = run(flight, **changes)
     known = truth(flight)["constants"]
     for sensor in SENSORS:
@@ -107,14 +107,14 @@ def test_every_choice_runs_to_the_end(flight: Recording, changes: dict[str, Any]
     assert results["verify"].tables["fit"].height == 12
 
 
-def test_the_onboard_profile_stops_at_equation_error(flight: Recording) -> None:
+def test_the_onboard_profile_stops_at_equation_error(flight: SimulatedFlight) -> None:
     results = run(flight, **PROFILES["onboard"])
     rows = results["gyro_output"].tables["calibration"]
     assert set(rows["method"]) == {"equation_error"}
     assert results["gyro_output"].status == "absent"
 
 
-def test_the_papers_five_comparisons_have_rows_with_units(flight: Recording) -> None:
+def test_the_papers_five_comparisons_have_rows_with_units(flight: SimulatedFlight) -> None:
     fit = run(flight)["verify"].tables["fit"]
     wanted = {
         ("attitude", "quest", "vps", "deg"),
@@ -130,7 +130,7 @@ def test_the_papers_five_comparisons_have_rows_with_units(flight: Recording) -> 
     assert np.abs(parts.to_numpy() - 1.0).max() < 1e-9
 
 
-def test_a_turned_sensor_in_ros_frames_gives_the_same_numbers(flight: Recording) -> None:
+def test_a_turned_sensor_in_ros_frames_gives_the_same_numbers(flight: SimulatedFlight) -> None:
     """The same flight logged in SI, FLU, ENU and specific force by a sensor turned in its mount."""
     e = replace(flight.experiment, dip_rad=1.1, vps_misalignment_rad=0.1)
     recording = simulate(e)
@@ -179,7 +179,7 @@ def test_the_wrong_gravity_sign_is_told() -> None:
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_a_wrong_polarity_never_gives_a_wrong_gyroscope(flight: Recording, sensor: str, axis: int) -> None:
+def test_a_wrong_polarity_never_gives_a_wrong_gyroscope(flight: SimulatedFlight, sensor: str, axis: int) -> None:
     polarity = settings(flight.experiment).polarity
     polarity = {**polarity, sensor: [-p if i == axis else p for i, p in enumerate(polarity[sensor])]}
     results = run(flight, polarity=polarity)
@@ -189,11 +189,11 @@ def test_a_wrong_polarity_never_gives_a_wrong_gyroscope(flight: Recording, senso
     assert any(results[stage].reason_code for stage in ("attitude", "attitude_pass2", "gyro_output"))
 
 
-def changed(recording: Recording, **counts: np.ndarray) -> Recording:
+def changed(recording: SimulatedFlight, **counts: np.ndarray) -> SimulatedFlight:
     return replace(recording, counts={**recording.counts, **counts})
 
 
-def test_recordings_that_cannot_tell_are_refused_with_numbers(flight: Recording) -> None:
+def test_recordings_that_cannot_tell_are_refused_with_numbers(flight: SimulatedFlight) -> None:
     still = simulate(replace(flight.experiment, peak_rad=(1e-4, 2e-4), tremor_rad=1e-5))
     short = simulate(replace(flight.experiment, duration_s=8.0))
     for recording in (still, short):
@@ -212,7 +212,7 @@ def test_recordings_that_cannot_tell_are_refused_with_numbers(flight: Recording)
 
 
 @pytest.mark.parametrize("missing", SENSORS)
-def test_a_missing_sensor_costs_what_needs_it_and_no_more(flight: Recording, missing: str) -> None:
+def test_a_missing_sensor_costs_what_needs_it_and_no_more(flight: SimulatedFlight, missing: str) -> None:
     tables = signals(flight)
     if missing == "magnetometer":
         del tables["magnetometer"]
@@ -237,7 +237,7 @@ def test_a_missing_sensor_costs_what_needs_it_and_no_more(flight: Recording, mis
         ("magnetometer", 10.0, "scale_not_nominal"),
     ],
 )
-def test_a_wrong_unit_is_told_by_its_scale(flight: Recording, sensor: str, factor: float, code: str) -> None:
+def test_a_wrong_unit_is_told_by_its_scale(flight: SimulatedFlight, sensor: str, factor: float, code: str) -> None:
     e = flight.experiment
     si = {n: flight.counts[n] * np.array(e.scale[n]) + np.array(e.bias[n]) for n in SENSORS}
     si[sensor] = si[sensor] * factor

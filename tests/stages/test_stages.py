@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from fieldcal.geometry.rotation import from_euler
 from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import settings, signals
-from fieldcal.simulation.experiment import NOISE_VARIANCE, Experiment, Recording, simulate
+from fieldcal.simulation.experiment import NOISE_VARIANCE, Experiment, SimulatedFlight, simulate
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import AXES
@@ -42,12 +42,12 @@ def relative_errors(results: Results, sensor: str) -> dict[tuple[str, str], floa
     return {(m, a): v / truth[a] - 1.0 for m, a, v, _ in scale_rows(results, sensor).iter_rows()}
 
 
-def run(recording: Recording, tables: dict[str, pl.DataFrame] | None = None, **changes: Any) -> Results:
+def run(recording: SimulatedFlight, tables: dict[str, pl.DataFrame] | None = None, **changes: Any) -> Results:
     return run_flight(tables or signals(recording), settings(recording.experiment, **changes))
 
 
 @cache
-def flight(dip_rad: float = 0.0) -> Recording:
+def flight(dip_rad: float = 0.0) -> SimulatedFlight:
     return simulate(seed=21, dip_rad=dip_rad, vps=False)
 
 
@@ -71,7 +71,7 @@ def test_wrong_polarity_never_passes_as_a_wrong_scale(dip_rad: float, sensor: st
 # geometry ------------------------------------------------------------------------------------------------------------
 
 
-def turned_like(recording: Recording, euler: np.ndarray, rate: np.ndarray) -> Recording:
+def turned_like(recording: SimulatedFlight, euler: np.ndarray, rate: np.ndarray) -> SimulatedFlight:
     """The recording with other attitudes (bank, pitch, heading (n, 3)) and body rates, and white noise of Table 1."""
     rng, body = np.random.default_rng(0), Rotation.from_quat(from_euler(euler)).inv()
     true = {

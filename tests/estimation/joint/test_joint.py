@@ -14,7 +14,7 @@ from fieldcal.estimation.joint import initialise, measurement_model
 from fieldcal.estimation.joint.fit import JointFit, fit_joint
 from fieldcal.estimation.joint.problem import TRIADS, Readings
 from fieldcal.geometry.rotation import angle_between
-from fieldcal.simulation.experiment import NOISE_VARIANCE, Experiment, Recording, constants_at, simulate
+from fieldcal.simulation.experiment import NOISE_VARIANCE, Experiment, SimulatedFlight, constants_at, simulate
 
 LEVER_ARM_M = (0.05, 0.02, -0.03)
 MOVING = {"translation_rms_mps2": 0.3, "lever_arm_m": LEVER_ARM_M}
@@ -32,7 +32,7 @@ MORE_ITERATIONS = 2
 SEEDS = (11, 12, 13, 14, 15, 16)
 
 
-def readings(r: Recording, **changes: Any) -> Readings:
+def readings(r: SimulatedFlight, **changes: Any) -> Readings:
     e = r.experiment
     segment = np.zeros(len(r.t), dtype=np.int64)
     given: dict[str, Any] = {
@@ -46,7 +46,7 @@ def readings(r: Recording, **changes: Any) -> Readings:
     return Readings(**{**given, **changes})
 
 
-def truth(r: Recording, name: str) -> tuple[np.ndarray, np.ndarray]:
+def truth(r: SimulatedFlight, name: str) -> tuple[np.ndarray, np.ndarray]:
     scale, bias = constants_at(r.experiment, name, 25.0)
     return np.asarray(scale), np.asarray(bias)
 
@@ -64,17 +64,17 @@ def own_start(given: Readings, e: Experiment) -> dict[str, Any]:
     return out
 
 
-def fitted(r: Recording, **changes: Any) -> JointFit:
+def fitted(r: SimulatedFlight, **changes: Any) -> JointFit:
     given = readings(r, **changes)
     model, start = initialise.prepare(given, own_start(given, r.experiment))
     return fit_joint(model, start)
 
 
-def relative_errors(r: Recording, fit: JointFit, name: str) -> np.ndarray:
+def relative_errors(r: SimulatedFlight, fit: JointFit, name: str) -> np.ndarray:
     return np.asarray(fit.constants(name)[0] / truth(r, name)[0] - 1.0)
 
 
-def normalised_errors(r: Recording, fit: JointFit) -> np.ndarray:
+def normalised_errors(r: SimulatedFlight, fit: JointFit) -> np.ndarray:
     """Error ÷ sd of the scales of every triad."""
     out = []
     for name in TRIADS:
@@ -84,7 +84,7 @@ def normalised_errors(r: Recording, fit: JointFit) -> np.ndarray:
     return np.concatenate(out)
 
 
-def normalised_zeros(r: Recording, fit: JointFit) -> np.ndarray:
+def normalised_zeros(r: SimulatedFlight, fit: JointFit) -> np.ndarray:
     """Error ÷ sd of the zeros −b/λ of every triad."""
     out = []
     for name in TRIADS:
@@ -140,12 +140,12 @@ def test_every_row_counts_in_one_interval(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.fixture(scope="module")
-def moving() -> list[tuple[Recording, JointFit]]:
+def moving() -> list[tuple[SimulatedFlight, JointFit]]:
     recordings = [simulate(seed=seed, **MOVING) for seed in SEEDS]
     return [(r, fitted(r)) for r in recordings]
 
 
-def test_translation_and_an_unknown_lever_arm_cost_little(moving: list[tuple[Recording, JointFit]]) -> None:
+def test_translation_and_an_unknown_lever_arm_cost_little(moving: list[tuple[SimulatedFlight, JointFit]]) -> None:
     """The serial chain refuses or misses these by tens of per cent. Medians; `benchmarks/joint_accuracy.py` has 32."""
     for name, bar in BARS.items():
         assert np.median([rms(relative_errors(r, fit, name)) for r, fit in moving]) < bar, name
@@ -154,12 +154,12 @@ def test_translation_and_an_unknown_lever_arm_cost_little(moving: list[tuple[Rec
         assert "lever_arm" in fit.layout
 
 
-def test_a_longer_record_takes_hardly_more_iterations(moving: list[tuple[Recording, JointFit]]) -> None:
+def test_a_longer_record_takes_hardly_more_iterations(moving: list[tuple[SimulatedFlight, JointFit]]) -> None:
     longer = fitted(simulate(seed=SEEDS[0], duration_s=160.0, sets=12, vps=False, **MOVING))
     assert longer.iterations <= max(fit.iterations for _, fit in moving) + MORE_ITERATIONS
 
 
-def test_scales_and_lever_arm_are_not_drawn_towards_nothing(moving: list[tuple[Recording, JointFit]]) -> None:
+def test_scales_and_lever_arm_are_not_drawn_towards_nothing(moving: list[tuple[SimulatedFlight, JointFit]]) -> None:
     """Noise in a regressor shrinks what stands beside it, the same way on every flight: the mean normalised error of a
     triad's scales over flights would show it (`test_joint_scores.py` has the gradients alone)."""
     errors = np.array([np.r_[normalised_errors(r, fit), normalised_lever_arm(fit)] for r, fit in moving])
@@ -167,7 +167,7 @@ def test_scales_and_lever_arm_are_not_drawn_towards_nothing(moving: list[tuple[R
     assert np.abs(errors.mean(axis=0)).max() < FARTHEST / np.sqrt(len(moving))
 
 
-def test_claimed_standard_deviations_are_honest(moving: list[tuple[Recording, JointFit]]) -> None:
+def test_claimed_standard_deviations_are_honest(moving: list[tuple[SimulatedFlight, JointFit]]) -> None:
     """The nine errors of a flight move together: as good as one degree of freedom each, so that the mean of six flights
     is χ²₆/6, within its 0.5 % and 99.5 % points. `benchmarks/joint_accuracy.py` has the median of 32."""
     low, high = chi2.ppf([0.005, 0.995], len(moving)) / len(moving)

@@ -14,7 +14,7 @@ from fieldcal.estimation.joint.fit import JointFit, fit_joint
 from fieldcal.estimation.joint.model_selection import add_terms, with_zeros
 from fieldcal.estimation.joint.problem import TERMS, Model, State
 from fieldcal.names import SENSORS
-from fieldcal.simulation.experiment import NOISE_VARIANCE, Recording, simulate
+from fieldcal.simulation.experiment import NOISE_VARIANCE, SimulatedFlight, simulate
 
 # Axes off by up to 1.7°; the accelerometer's first axis is the body's.
 MIXED = {
@@ -30,7 +30,7 @@ ZERO_COUNTS = 12.0
 MOVING = {"translation_rms_mps2": 0.3, "lever_arm_m": (0.05, 0.02, -0.03)}
 
 
-def crossed(r: Recording, *names: str) -> dict[str, np.ndarray]:
+def crossed(r: SimulatedFlight, *names: str) -> dict[str, np.ndarray]:
     """Counts of triads whose true model is z = (I + E)(Λ c + b)."""
     out = dict(r.counts)
     for name in names:
@@ -39,17 +39,17 @@ def crossed(r: Recording, *names: str) -> dict[str, np.ndarray]:
     return out
 
 
-def late(r: Recording, name: str) -> dict[str, np.ndarray]:
+def late(r: SimulatedFlight, name: str) -> dict[str, np.ndarray]:
     return {**r.counts, name: np.column_stack([np.interp(r.t - DELAY_S, r.t, x) for x in r.counts[name].T])}
 
 
-def prepared(r: Recording, counts: dict[str, np.ndarray], **changes: Any) -> tuple[Model, State]:
+def prepared(r: SimulatedFlight, counts: dict[str, np.ndarray], **changes: Any) -> tuple[Model, State]:
     segment = np.zeros(len(r.t), dtype=np.int64)
     given = readings(r, **counts, turning=initialise.turning(r.t, segment, counts["gyroscope"]), **changes)
     return initialise.prepare(given, own_start(given, r.experiment))
 
 
-def fitted(r: Recording, counts: dict[str, np.ndarray], **changes: Any) -> JointFit:
+def fitted(r: SimulatedFlight, counts: dict[str, np.ndarray], **changes: Any) -> JointFit:
     return fit_joint(*prepared(r, counts, **changes))
 
 

@@ -11,7 +11,7 @@ from numerics_support import rms
 
 from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import settings, signals
-from fieldcal.simulation.experiment import Recording, constants_at, simulate
+from fieldcal.simulation.experiment import SimulatedFlight, constants_at, simulate
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import AXES
@@ -21,11 +21,11 @@ FAULTY = {"vps_dropout_share": 0.1, "vps_outlier_share": 0.01, "vps_skew_ppm": 2
 SEEDS = (41, 42, 43)
 
 
-def flown(r: Recording, **changes: Any) -> dict[str, StageResult]:
+def flown(r: SimulatedFlight, **changes: Any) -> dict[str, StageResult]:
     return run_flight(signals(r), settings(r.experiment, method="joint", lever_arm_m=None, **changes))
 
 
-def scales(results: dict[str, StageResult], r: Recording, name: str) -> tuple[np.ndarray, np.ndarray]:
+def scales(results: dict[str, StageResult], r: SimulatedFlight, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Relative errors, and errors over their sd."""
     rows = results["joint"].tables["calibration"].filter(pl.col("axis").is_in(AXES), sensor=name, parameter="scale")
     true = np.asarray(constants_at(r.experiment, name, 25.0)[0])
@@ -34,23 +34,23 @@ def scales(results: dict[str, StageResult], r: Recording, name: str) -> tuple[np
 
 
 @pytest.fixture(scope="module")
-def flights() -> list[tuple[Recording, dict[str, StageResult]]]:
+def flights() -> list[tuple[SimulatedFlight, dict[str, StageResult]]]:
     recordings = [simulate(seed=seed, **MOVING, **FAULTY) for seed in SEEDS]
     return [(r, flown(r, use_vps=True)) for r in recordings]
 
 
-def test_constants_are_of_reference_grade(flights: list[tuple[Recording, dict[str, StageResult]]]) -> None:
+def test_constants_are_of_reference_grade(flights: list[tuple[SimulatedFlight, dict[str, StageResult]]]) -> None:
     """Twice the medians of `benchmarks/joint_vps.py`; without the VPS they are 0.6, 0.7 and 1.1 %."""
     for name, bar in (("magnetometer", 0.001), ("accelerometer", 0.006), ("gyroscope", 0.006)):
         assert np.median([rms(scales(results, r, name)[0]) for r, results in flights]) < bar, name
 
 
-def test_claimed_sd_are_honest(flights: list[tuple[Recording, dict[str, StageResult]]]) -> None:
+def test_claimed_sd_are_honest(flights: list[tuple[SimulatedFlight, dict[str, StageResult]]]) -> None:
     normal = np.concatenate([scales(results, r, name)[1] for r, results in flights for name in SENSORS])
     assert 0.6 < rms(normal) < 1.6
 
 
-def test_its_use_and_its_clock_are_told(flights: list[tuple[Recording, dict[str, StageResult]]]) -> None:
+def test_its_use_and_its_clock_are_told(flights: list[tuple[SimulatedFlight, dict[str, StageResult]]]) -> None:
     for r, results in flights:
         measured = results["joint"].measured
         assert measured["use_vps"] is True
