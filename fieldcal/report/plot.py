@@ -110,10 +110,11 @@ def panels(
 
 
 def solid_panels(columns: int, *, height_in: float) -> tuple[Figure, list[Any]]:
-    """A figure of the page's width with three-dimensional panels, which matplotlib has no types of."""
+    """A figure of the page's width with three-dimensional panels."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(_WIDTH_IN, height_in))
+    # Any: matplotlib has no types of its three-dimensional axes.
     axes: list[Any] = [figure.add_subplot(1, columns, i + 1, projection="3d") for i in range(columns)]
     for axis in axes:
         for own in (axis.xaxis, axis.yaxis, axis.zaxis):

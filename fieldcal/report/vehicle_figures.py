@@ -113,8 +113,8 @@ def _panel_row(axes: list[Axes], rows: pl.DataFrame, trend: DriftRow | None, veh
         warm = np.linspace(known.min(), known.max(), 60)
         _band(axes[1], warm, predicted(trend, warm, 0.0))
     if changed is not None and dated:
-        step: Any = changed  # a moment, which matplotlib takes and its types do not
-        axes[0].axvline(step, color=INK["warn"], linewidth=1.0, linestyle=(0, (4, 2)))
+        # Moments are taken too, which matplotlib's types do not say.
+        axes[0].axvline(changed, color=INK["warn"], linewidth=1.0, linestyle=(0, (4, 2)))  # type: ignore[arg-type]
     if dated:
         _dates(axes[0])
     else:
