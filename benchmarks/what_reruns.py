@@ -19,9 +19,9 @@ from pathlib import Path
 
 import fieldcal
 from fieldcal.provenance.reached_code import reach
+from fieldcal.provenance.run_key import dotted_name
 from fieldcal.provenance.source_tree import SourceTree
 from fieldcal.stages.pipeline import PIPELINE
-from fieldcal.stages.run_key import dotted_name
 
 EDITED = ("fieldcal.geometry.rotation", "to_rotation_vector")
 FORMER, LATTER = "where=sine > 1e-12", "where=sine > 2e-12"

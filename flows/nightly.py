@@ -23,8 +23,8 @@ from fieldcal.flows.pool import hand_over, pool_answers
 from fieldcal.flows.processes import process_answers, spawned
 from fieldcal.flows.runners import Answers, Parallel, batches, dask_answers
 from fieldcal.flows.tasks import run_batch, run_publish, unseen
+from fieldcal.provenance.run_key import code_digest
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.stages.run_key import code_digest
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.words.talk import say
 

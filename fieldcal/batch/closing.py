@@ -10,9 +10,9 @@ from pathlib import Path
 from fieldcal.batch.sources import TRENDS, sources
 from fieldcal.config.configuration import Alerts
 from fieldcal.names import Json
+from fieldcal.provenance.run_key import run_key
 from fieldcal.schemas import TABLES
 from fieldcal.schemas.arrow import VERSION_KEY
-from fieldcal.stages.run_key import run_key
 from fieldcal.trends.changes import Change, changes, last_usable
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.checksums import history_digest

@@ -14,8 +14,8 @@ from fieldcal.config.find import Source, configuration_of
 from fieldcal.errors import unforeseen
 from fieldcal.flight.job import Job, PlainJob
 from fieldcal.flight.threads import one_thread
+from fieldcal.provenance.run_key import code_digest
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.stages.run_key import code_digest
 from fieldcal.warehouse.errors import WarehouseError
 
 OTHER_CODE: list[str] = [

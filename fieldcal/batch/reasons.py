@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Mapping
 
 from fieldcal.flight.record import Causes, Record
-from fieldcal.stages.run_key import LIBRARIES
+from fieldcal.provenance.run_key import LIBRARIES
 
 NO_RESULT = "no result yet"
 LONGEST_VALUE = 40

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from fieldcal.logs import ingest
+from fieldcal.provenance.run_key import code_digest, source_digest
 from fieldcal.stages.pipeline import INGEST, PIPELINE
-from fieldcal.stages.run_key import code_digest, source_digest
 from fieldcal.stages.stage import Stage, refused_beforehand
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal

@@ -27,10 +27,10 @@ from fieldcal.logs import ingest
 from fieldcal.logs.facts import Facts
 from fieldcal.logs.tidy import Disordered
 from fieldcal.names import Json, Status, Verdict
+from fieldcal.provenance.run_key import run_key
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.pipeline import INGEST, PIPELINE
 from fieldcal.stages.results import StageResult, plain
-from fieldcal.stages.run_key import run_key
 from fieldcal.stages.stage import Stage, run_stage
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.files import file_sha256

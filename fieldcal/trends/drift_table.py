@@ -9,9 +9,9 @@ import numpy as np
 import polars as pl
 
 from fieldcal.names import GRAVEST_FIRST, Status
+from fieldcal.provenance.run_key import run_key, source_digest
 from fieldcal.schemas import TABLES
 from fieldcal.schemas.rows import DriftRow
-from fieldcal.stages.run_key import run_key, source_digest
 from fieldcal.trends import few_sessions, regression, siblings
 from fieldcal.trends.curves import Bends, Bent, bends_of, bent
 from fieldcal.trends.evidence import evidence

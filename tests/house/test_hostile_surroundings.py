@@ -182,7 +182,7 @@ import fieldcal.warehouse.query, fieldcal.warehouse.questions
 from fieldcal.batch.flights import flights
 from fieldcal.batch.jobs import find_jobs
 from fieldcal.config.find import configuration_of, find_source
-from fieldcal.stages.run_key import code_digest
+from fieldcal.provenance.run_key import code_digest
 from fieldcal.cli import main as cli
 archive, root = Path(sys.argv[1]), Path(sys.argv[2])
 digest = code_digest()

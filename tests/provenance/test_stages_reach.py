@@ -27,11 +27,11 @@ from fieldcal.config.stage_settings import taken_from
 from fieldcal.logs import find_logs, ingest
 from fieldcal.provenance.module_source import ModuleSource, parse_module
 from fieldcal.provenance.reached_code import reach, reach_digest
+from fieldcal.provenance.run_key import dotted_name
 from fieldcal.provenance.source_tree import SourceTree, installed
 from fieldcal.simulation.archive import settings, signals, write_flights
 from fieldcal.simulation.experiment import Experiment, simulate
 from fieldcal.stages.pipeline import PIPELINE
-from fieldcal.stages.run_key import dotted_name
 from fieldcal.stages.stage import refused_beforehand
 from fieldcal.trends.drift_table import update_drift
 

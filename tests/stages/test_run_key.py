@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from fieldcal.config.configuration import load
+from fieldcal.provenance import run_key
+from fieldcal.provenance.run_key import source_digest
 from fieldcal.provenance.source_tree import SourceTree
-from fieldcal.stages import run_key
-from fieldcal.stages.run_key import source_digest
 
 
 def test_wrapped_and_partial_functions_are_seen_through() -> None:
@@ -68,7 +68,7 @@ def test_parameters_must_be_plain_json() -> None:
 def test_the_key_is_the_same_in_every_process() -> None:
     script = """
         from fieldcal.config.configuration import load
-        from fieldcal.stages.run_key import run_key, source_digest
+        from fieldcal.provenance.run_key import run_key, source_digest
         print(run_key("s", source_digest(load), load(None).vehicle("v").settings(), {"imu": "1", "vps": "2"}))
     """
     found = {
