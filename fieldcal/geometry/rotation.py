@@ -11,8 +11,8 @@ from fieldcal.geometry.intervals import interval_of, share_of_interval
 
 Array = NDArray[np.floating[Any]]  # of any width, because numpy.linalg's answers are so to the type check
 
-IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
-"""The quaternion of no rotation."""
+IDENTITY = np.broadcast_to(np.array([0.0, 0.0, 0.0, 1.0]), 4)
+"""The quaternion of no rotation; read-only, as every user has the same one."""
 
 
 def skew(v: ArrayLike) -> Array:
