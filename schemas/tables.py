@@ -6,6 +6,19 @@ from fieldcal.schemas import columns as c
 from fieldcal.schemas.column import Column, Table
 
 _HISTORY_FLIGHT_KEY = ("flight_id",)
+_CONSTANTS = (
+    c.SENSOR,
+    c.METHOD,
+    c.PARAMETER,
+    c.AXIS,
+    c.VALUE,
+    c.SD,
+    c.UNIT,
+    c.TEMPERATURE_DEGC,
+    c.STATUS,
+    c.REASON_CODE,
+)
+"""A calibrated parameter of one axis."""
 
 _SIGNALS = (
     Table(
@@ -99,19 +112,7 @@ _STAGES = (
         "stage",
         1,
         "constants from the first part of a flight alone, which predict the rest of it",
-        (
-            c.SENSOR,
-            c.METHOD,
-            c.PARAMETER,
-            c.AXIS,
-            c.VALUE,
-            c.SD,
-            c.UNIT,
-            c.TEMPERATURE_DEGC,
-            c.STATUS,
-            c.REASON_CODE,
-            c.FROM_NS,
-        ),
+        (*_CONSTANTS, c.FROM_NS),
         ("sensor", "method", "parameter", "axis"),
     ),
     Table(
@@ -163,20 +164,7 @@ _HISTORY = (
         "history",
         1,
         "one row a sensor, method, parameter and axis of a flight",
-        (
-            *c.LEAD,
-            c.SENSOR,
-            c.METHOD,
-            c.PARAMETER,
-            c.AXIS,
-            c.VALUE,
-            c.SD,
-            c.UNIT,
-            c.TEMPERATURE_DEGC,
-            c.STATUS,
-            c.REASON_CODE,
-            c.RUN_KEY,
-        ),
+        (*c.LEAD, *_CONSTANTS, c.RUN_KEY),
         ("flight_id", "sensor", "method", "parameter", "axis"),
     ),
     Table(

@@ -18,7 +18,7 @@ from fieldcal.exports.calibration import Constants
 from fieldcal.flight.calibrate import CalibratedLog, LogRead, identify, overruled, read, run_stages
 from fieldcal.flight.rows import rows_frame
 from fieldcal.geometry import sensor_model
-from fieldcal.names import PREFERRED_METHODS, SENSORS, Json
+from fieldcal.names import SENSORS, Json, exactness
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.rows import FlightDocument, Refusable, SyncRow
 from fieldcal.stages.tables import matrix, seconds
@@ -139,15 +139,7 @@ class Calibration:
         """Methods that have numbers for a sensor, refused ones too, the most exact first."""
         scales = self.rows.filter(pl.col("sensor") == sensor, pl.col("parameter") == "scale")
         found = scales["method"].unique().to_list()
-        return tuple(
-            sorted(
-                found,
-                key=lambda name: (
-                    PREFERRED_METHODS.index(name) if name in PREFERRED_METHODS else len(PREFERRED_METHODS),
-                    name,
-                ),
-            )
-        )
+        return tuple(sorted(found, key=lambda name: (exactness(name), name)))
 
     def sensor(self, sensor: str, method: str | None = None) -> SensorCalibration:
         """A sensor's constants by `method`, else by the most exact that was not refused.
@@ -241,8 +233,7 @@ class Calibration:
             t, z = rates
         elif own.method is not None and sensor != "gyroscope":
             t, logged = self.recording.readings(sensor)
-            scale, bias = own.scale.refused_value(), own.bias.refused_value()
-            z = sensor_model.calibrate(logged, scale if scale.ndim == 2 else np.diag(scale), bias)
+            z = sensor_model.calibrate(logged, own.scale.refused_value(), own.bias.refused_value())
         length = None
         if sensor != "gyroscope" and self._log.settings:
             s = self._log.settings
@@ -266,9 +257,8 @@ class Calibration:
         if own.method is None or s is None:
             return None
         t, logged = self.recording.readings("gyroscope")
-        scale, bias = own.scale.refused_value(), own.bias.refused_value()
         axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
-        z = sensor_model.calibrate(logged, scale if scale.ndim == 2 else np.diag(scale), bias)
+        z = sensor_model.calibrate(logged, own.scale.refused_value(), own.bias.refused_value())
         return t, z @ axes.T
 
     def _vps_rates(self) -> Rates | None:

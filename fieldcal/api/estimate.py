@@ -10,8 +10,7 @@ import numpy as np
 from fieldcal.errors import Refused
 from fieldcal.geometry.rotation import Array
 from fieldcal.reason_codes import ReasonCode
-
-AXES = ("x", "y", "z")
+from fieldcal.stages.tables import AXES
 
 
 @dataclass(frozen=True, repr=False)

@@ -9,10 +9,11 @@ import numpy as np
 import polars as pl
 from numpy.typing import ArrayLike
 
-from fieldcal.api.estimate import AXES, Estimate
+from fieldcal.api.estimate import Estimate
 from fieldcal.exports.calibration import Triad
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
+from fieldcal.stages.tables import AXES
 
 PARAMETERS = ("scale", "bias", "zero")
 
@@ -64,9 +65,7 @@ class SensorCalibration:
 
     def apply(self, logged: ArrayLike) -> Array:
         """Calibrated readings z (n, 3) of logged ones (n, 3), both in the sensor axes as logged. Raises `Refused`."""
-        scale = self.scale.value
-        matrix = scale if scale.ndim == 2 else np.diag(scale)
-        return sensor_model.calibrate(np.asarray(logged, dtype=float), matrix, self.bias.value)
+        return sensor_model.calibrate(logged, self.scale.value, self.bias.value)
 
     def triad(self, why: str) -> Triad:
         """The constants to fly with, as of this flight's temperature; `why`: where they come from. Raises `Refused`."""

@@ -10,18 +10,18 @@ from rich.console import Console
 from fieldcal.cli.show import table
 from fieldcal.names import Status
 from fieldcal.schemas.rows import CalibrationRow, FitRow, FlightDocument, UnfoldedRun
+from fieldcal.stages.tables import AXES
 from fieldcal.words.flights import QUANTITIES, advised, is_consequence, sync_sentence, verdict_sentence
 from fieldcal.words.numbers import cell, number, with_sd
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-AXES = ("x", "y", "z")
 PARAMETERS = ("scale", "zero", "bias")
 
 
 def print_flight(console: Console, document: FlightDocument) -> None:
-    """Print what `fieldcal.flight.calibrate.calibrate_log` found."""
+    """Print what `fieldcal.calibrate` found."""
     flight = document["flight"]
     console.print(verdict_sentence(flight), markup=False)
     for finding in flight["findings"] or []:

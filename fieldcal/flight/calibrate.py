@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
@@ -30,8 +29,8 @@ from fieldcal.words.rows import rows_of, typed, unfolded
 
 @dataclass(frozen=True)
 class CalibratedLog:
-    """One log's results: `document` as `calibrate_log` returns it, every `stage.table`, and the flight's settings, None
-    of a log that is not usable."""
+    """One log's results: `document` is what `fieldcal calibrate --json` prints; every `stage.table`; the flight's
+    settings, None of a log that is not usable."""
 
     document: FlightDocument
     tables: dict[str, pl.DataFrame]
@@ -47,30 +46,6 @@ class LogRead:
     vehicle: Vehicle
     signals: dict[str, pl.DataFrame]
     facts: Facts
-
-
-def calibrate_log(log: Path, config: Path | None = None, **choices: Any) -> FlightDocument:
-    """Calibrate one log; its flight, calibration, fit, sync and run, named as the columns of those tables. Arguments
-    and errors as in `run_log`."""
-    return run_log(log, config, **choices).document
-
-
-def run_log(
-    log: Path,
-    config: Path | None = None,
-    *,
-    vehicle_id: str | None = None,
-    session_id: str | None = None,
-    profile: str | None = None,
-    method: str | None = None,
-    changes: dict[str, str] | None = None,
-) -> CalibratedLog:
-    """Calibrate one log; what it says, and all tables on the way. Errors as in `read`.
-
-    `profile`, `method` and `changes` overrule the configuration's own.
-    """
-    job, vehicle = identify(log, config, vehicle_id=vehicle_id, session_id=session_id)
-    return run_stages(read(job, overruled(vehicle, profile=profile, method=method, changes=changes)))
 
 
 def identify(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from fieldcal.names import PREFERRED_METHODS
+from fieldcal.names import exactness
 from fieldcal.words.numbers import number, with_sd
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -49,12 +49,6 @@ def age(moment: datetime | None, as_of: datetime | None) -> str:
     if days < 0:
         return f"{-days:.0f} d after"
     return f"{days * 24:.0f} h" if days < 1 else f"{days:.0f} d"
-
-
-def exactness(method: str) -> int:
-    """Place of an estimator among all, 0 the most exact; those that nobody ordered come last."""
-    order = [str(known) for known in PREFERRED_METHODS]
-    return order.index(method) if method in order else len(order)
 
 
 def preferred(methods: set[str]) -> str:

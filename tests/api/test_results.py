@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fieldcal
-from fieldcal.flight.calibrate import run_log
+from fieldcal.flight.calibrate import identify, read, run_stages
 
 SENSORS = ("magnetometer", "accelerometer", "gyroscope")
 NEVER_ABOUT_Z = (1.0, 1.0, 0.0)
@@ -61,7 +61,7 @@ def test_a_bad_log_is_a_verdict_and_not_an_exception(tmp_path: Path) -> None:
 
 
 def test_what_is_calibrated_is_what_the_pipeline_found(log: Path, calibration: fieldcal.Calibration) -> None:
-    assert calibration.document == run_log(log).document
+    assert calibration.document == run_stages(read(*identify(log))).document
     assert fieldcal.calibrate(fieldcal.read_log(log)).document == calibration.document
     rows = {(r["sensor"], r["method"], r["parameter"], r["axis"]): r for r in calibration.document["calibration"]}
     for name in SENSORS:

@@ -15,6 +15,7 @@ from mcap_ros2.writer import Writer as Ros2Writer
 from numerics_support import autoregressive
 from scipy.spatial.transform import Rotation
 
+import fieldcal
 from fieldcal.config.configuration import CsvMap, McapMap
 from fieldcal.errors import UnreadableLog
 from fieldcal.estimation.motor_field import (
@@ -25,7 +26,6 @@ from fieldcal.estimation.motor_field import (
     motor_fault,
     motor_field,
 )
-from fieldcal.flight.calibrate import calibrate_log
 from fieldcal.logs import read_log
 from fieldcal.logs.encodings.ros2_definitions import full_text
 from fieldcal.simulation.archive import write_flights
@@ -182,7 +182,7 @@ def flown(folder: Path, share: float, *columns: str, memory: float = 0.998) -> P
 
 def calibrated(log: Path) -> tuple[dict[str, Any], dict[str, Any], set[tuple[str, str | None]]]:
     """The flight's row, what `vectors` measured, and status and code of the magnetometer's rows."""
-    document = calibrate_log(log)
+    document = fieldcal.calibrate(log).document
     vectors = next(row for row in document["run"] if row["stage"] == "vectors")
     assert vectors["status"] == "ok"
     rows = {(r["status"], r["reason_code"]) for r in document["calibration"] if r["sensor"] == "magnetometer"}
@@ -217,7 +217,7 @@ def test_a_field_of_five_per_cent_is_told(tmp_path: Path, drive: str) -> None:
 def test_the_sd_allows_for_a_field_that_was_told(tmp_path: Path) -> None:
     """A slow current's field is taken for scale: by 4.7 % here, which no residual shows."""
     truth = Experiment(seed=21).scale["magnetometer"]
-    document = calibrate_log(flown(tmp_path, 0.05, "current_a"))
+    document = fieldcal.calibrate(flown(tmp_path, 0.05, "current_a")).document
     rows = [row for row in document["calibration"] if row["sensor"] == "magnetometer" and row["parameter"] == "scale"]
     assert {row["status"] for row in rows} == {"ok"}
     found, sd = (np.array([row[column] for row in rows]) for column in ("value", "sd"))
@@ -243,7 +243,7 @@ def test_a_field_of_thirteen_per_cent_refuses_the_magnetometer_with_the_number(t
 
 def test_no_gyroscope_is_fitted_to_an_attitude_from_such_a_magnetometer(tmp_path: Path) -> None:
     """Its scale would be off by 5 % about z."""
-    document = calibrate_log(flown(tmp_path, 0.13, "current_a", memory=0.95))
+    document = fieldcal.calibrate(flown(tmp_path, 0.13, "current_a", memory=0.95)).document
     assert [r for r in document["calibration"] if r["sensor"] == "gyroscope" and r["status"] == "ok"] == []
     pass2 = next(row for row in document["run"] if row["stage"] == "gyro_equation_pass2")
     assert (pass2["status"], pass2["reason_code"]) == ("refused", "motor_field")
@@ -254,7 +254,7 @@ def test_the_joint_estimate_publishes_no_such_magnetometer(tmp_path: Path) -> No
     config = tmp_path / "fieldcal.toml"
     text = config.read_text(encoding="utf-8").replace('world = "ned"', 'world = "ned"\nmethod = "joint"')
     config.write_text(text, encoding="utf-8")
-    rows = calibrate_log(log)["calibration"]
+    rows = fieldcal.calibrate(log).document["calibration"]
     assert [r for r in rows if r["sensor"] == "magnetometer" and r["status"] == "ok"] == []
 
 

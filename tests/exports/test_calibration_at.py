@@ -14,10 +14,10 @@ from mcap.reader import make_reader
 from mcap_ros2.reader import read_ros2_messages
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+import fieldcal
 from fieldcal.cli.main import run
 from fieldcal.config.configuration import load
 from fieldcal.exports.calibration_at import constants_of
-from fieldcal.flight.calibrate import calibrate_log
 from fieldcal.geometry.frames import FRD_FROM_FLU
 from fieldcal.logs import ingest, log_sha256
 from fieldcal.logs.mcap.write import imu_channel, write_mcap
@@ -41,7 +41,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def root(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The flight's calibration, and another axis of it for what a full matrix would leave behind."""
     root = tmp_path_factory.mktemp("fly") / "warehouse"
-    document = calibrate_log(log)
+    document = fieldcal.calibrate(log).document
     lead = {k: document["flight"][k] for k in ("flight_id", "vehicle_id", "imu_id", "session_id", "started_at")}
     rows = [{**row, **lead} for row in document["calibration"]]
     schema = empty_frame("calibration").schema
@@ -54,7 +54,7 @@ def root(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def wanted(log: Path, root: Path) -> dict[str, np.ndarray]:
     """Eq. 5 by hand: scale · counts + bias with the flight's own constants."""
     signals, _ = ingest.read_flight(log, load(log.parents[2] / "fieldcal.toml").vehicle("sim-1"))
-    document = calibrate_log(log)
+    document = fieldcal.calibrate(log).document
     rows = {(r["sensor"], r["parameter"], r["axis"], r["method"]): r["value"] for r in document["calibration"]}
     methods = {"gyroscope": "output_error", "accelerometer": "ellipsoid_robust", "magnetometer": "ellipsoid_robust"}
     result = {}

@@ -22,7 +22,7 @@ from fieldcal.batch.steps import FlightWork
 from fieldcal.cli.main import run
 from fieldcal.config.find import configuration_of, find_source
 from fieldcal.errors import FieldcalError
-from fieldcal.flight.calibrate import run_log
+from fieldcal.flight.calibrate import identify, read, run_stages
 from fieldcal.flight.rows import flight_row, published_tables, rows_frame, run_rows
 from fieldcal.flight.rows import lead as lead_of
 from fieldcal.report import (
@@ -287,7 +287,7 @@ def test_flight_without_vps_compares_with_nothing(tmp_path: Path) -> None:
 
 def test_refused_flight_says_why_in_place_of_figures(tmp_path: Path) -> None:
     (log,) = write_flights(tmp_path / "archive", Experiment(seed=6, translation_rms_mps2=3.0))
-    result = run_log(log)
+    result = run_stages(read(*identify(log)))
     refused = [row for row in result.document["run"] if row["status"] == "refused"]
     assert refused
     page = sound(log_report(result, tmp_path / "flight.html"))

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from report_rows import publish_fleet
 
-from fieldcal.flight.calibrate import run_log
+from fieldcal.flight.calibrate import identify, read, run_stages
 from fieldcal.report import log_report, write_night_reports
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
@@ -89,7 +89,11 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     )
     fleet, vehicle = write_night_reports(root, ["bravo"])
     (log,) = write_flights(root / "archive", Experiment(seed=4, dip_rad=np.radians(60.0), translation_rms_mps2=0.03))
-    return {"fleet": fleet, "vehicle": vehicle, "flight": log_report(run_log(log), root / "flight.html")}
+    return {
+        "fleet": fleet,
+        "vehicle": vehicle,
+        "flight": log_report(run_stages(read(*identify(log))), root / "flight.html"),
+    }
 
 
 def show(browser: Any, path: Path, scheme: str = "light") -> None:
