@@ -7,7 +7,7 @@ Everything below carries a `reason_code` for tables and a sentence for people.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Self
 
 from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
@@ -41,7 +41,7 @@ class FieldcalError(Exception):
         self.sentence = sentence
         self.measured: dict[str, Json] = dict(measured or {})
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[type[Self], tuple[ReasonCode, str, dict[str, Json]]]:
         """Copies whole, also between processes."""
         return type(self), (self.reason_code, self.sentence, self.measured)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -63,7 +63,7 @@ class StageRun:
     status: str
     reason_code: str | None
     reason: str | None
-    measured: Mapping[str, Any]
+    measured: Mapping[str, Json]
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from fieldcal.errors import Refused
 from fieldcal.geometry.rotation import Array
@@ -100,7 +100,7 @@ class Estimate:
             return float(self._value[row]) if row == column else 0.0
         return float(self._value[row, column])
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> Array:
         """The value, for numpy. Raises `Refused`."""
         return np.asarray(self.value, dtype=dtype)
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import polars as pl
 
 from fieldcal.flight.calibrate import LogRead, identify, read
 from fieldcal.geometry.rotation import Array
+from fieldcal.logs.facts import Facts
 from fieldcal.logs.ingest import started_at
 from fieldcal.names import SENSORS
 from fieldcal.stages.tables import matrix, seconds, triad
@@ -101,15 +102,14 @@ class Recording:
         return dict(self.source.signals)
 
     @property
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         """What is known of the flight, plain values."""
-        return dict(self.source.facts)
+        return self.source.facts.copy()
 
     @property
     def reason_code(self) -> str | None:
         """Identifier of the reason; None for an "ok" log."""
-        code: str | None = self.source.facts["reason_code"]
-        return code
+        return self.source.facts["reason_code"]
 
     @property
     def findings(self) -> tuple[Finding, ...]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal
 
 import numpy as np
 import polars as pl
@@ -13,7 +14,9 @@ from fieldcal.api.estimate import Estimate
 from fieldcal.exports.calibration import Triad
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
+from fieldcal.schemas.rows import CalibrationRow
 from fieldcal.stages.tables import AXES
+from fieldcal.words.rows import typed
 
 PARAMETERS = ("scale", "bias", "zero")
 
@@ -105,27 +108,28 @@ def not_calibrated(sensor: str, reason_code: str, reason: str) -> SensorCalibrat
 
 def estimate(rows: pl.DataFrame, sensor: str, method: str, parameter: str, reason: str | None) -> Estimate:
     """One parameter from its rows, an axis or a matrix element each."""
-    found = {row["axis"]: row for row in rows.filter(pl.col("parameter") == parameter).iter_rows(named=True)}
+    own = typed(rows.filter(pl.col("parameter") == parameter).iter_rows(named=True), CalibrationRow)
+    found = {row["axis"]: row for row in own}
     first = found["x"]
-    names = [[a + b for b in AXES] for a in AXES] if "xy" in found else list(AXES)
     codes = [found[axis]["reason_code"] for axis in AXES if found[axis]["status"] != "ok"]
-    x, y, z = (str(found[axis]["status"]) for axis in AXES)
+    x, y, z = (found[axis]["status"] for axis in AXES)
     return Estimate(
         sensor=sensor,
         method=method,
         parameter=parameter,
-        unit=str(first["unit"]),
-        sd=_numbers(found, names, "sd"),
+        unit=first["unit"],
+        sd=_numbers(found, "sd"),
         temperature_degc=first["temperature_degc"],
         status=(x, y, z),
         reason_code=codes[0] if codes else None,
         reason=reason if codes else None,
-        _value=_numbers(found, names, "value"),
+        _value=_numbers(found, "value"),
     )
 
 
-def _numbers(found: dict[str, dict[str, Any]], names: list[Any], column: str) -> Array:
-    """A column by axis, in the form of `names`; what is null is NaN."""
-    if isinstance(names[0], list):
-        return np.stack([_numbers(found, own, column) for own in names])
-    return np.array([np.nan if found[name][column] is None else found[name][column] for name in names], dtype=float)
+def _numbers(found: Mapping[str, CalibrationRow], column: Literal["value", "sd"]) -> Array:
+    """A column by axis, (3,), or by element where there are cross-axis terms, (3, 3); what is null is NaN."""
+    full = "xy" in found
+    names = [a + b for a in AXES for b in AXES] if full else AXES
+    numbers = np.array([found[name][column] for name in names], dtype=float)
+    return numbers.reshape(3, 3) if full else numbers

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Literal
 
 from fieldcal.errors import FieldcalError, Refused
 from fieldcal.geometry.rotation import Array
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas.rows import SyncRow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,7 +45,7 @@ class VpsClock:
     reason: str | None
     peak: float | None
     runner_up: float | None
-    _row: Mapping[str, Any] = field(repr=False)
+    _row: SyncRow = field(repr=False)
     _rates: tuple[Rates, Rates] | None = field(repr=False)
 
     @property
@@ -92,8 +92,9 @@ class VpsClock:
             )
         return plot_clock(*self._rates, title)
 
-    def _number(self, name: str) -> float:
+    def _number(self, name: Literal["lag_s", "lag_mid_s", "lag_sd_s", "skew_ppm", "skew_sd_ppm"]) -> float:
         if self.status != "ok":
             sentence = f"The VPS's clock ({name}) was refused. {self.reason or ''}"
             raise Refused(ReasonCode(self.reason_code or ReasonCode.NOT_USABLE), sentence.strip())
-        return float(self._row[name])
+        value = self._row[name]
+        return float("nan") if value is None else value

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
@@ -12,6 +11,7 @@ from fieldcal.config.configuration import Configuration
 from fieldcal.flight.job import Job
 from fieldcal.flight.record import Record
 from fieldcal.flight.rows import StageTables, flight_row, judged, lead, published_tables, rows_frame, run_rows
+from fieldcal.schemas.rows import FlightRow, RunRow
 from fieldcal.stages.pipeline import INGEST, PUBLISHED
 from fieldcal.warehouse.publish import publish, read_history
 from fieldcal.warehouse.stage_store import StageStore
@@ -50,13 +50,14 @@ def withdraw(root: Path, vehicle_id: str, flights: set[str]) -> None:
 
 def _rows(flights: Sequence[tuple[Job, Mapping[str, Record]]], imu_id: str) -> dict[str, pl.DataFrame]:
     """`flight` and `run` as they should be."""
-    rows: dict[str, list[dict[str, Any]]] = {"flight": [], "run": []}
+    flight_rows: list[FlightRow] = []
+    step_rows: list[RunRow] = []
     for job, records in flights:
         facts = judged(records[INGEST]["facts"], records)
         leading = lead(job, imu_id, facts)
-        rows["flight"].append(flight_row(job, leading, facts))
-        rows["run"] += run_rows(leading, records)
-    return {table: rows_frame(table, own) for table, own in rows.items()}
+        flight_rows.append(flight_row(job, leading, facts))
+        step_rows += run_rows(leading, records)
+    return {"flight": rows_frame("flight", flight_rows), "run": rows_frame("run", step_rows)}
 
 
 def _differing(

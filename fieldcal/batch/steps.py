@@ -213,7 +213,7 @@ class FlightWork:
             status = Status.FAILED
         measured = {"rows": facts["rows"], "units": facts["units"], "verdict": facts["verdict"]}
         record = _record(status, facts["reason_code"], facts["reason"], measured, self._causes(INGEST))
-        record["facts"], record["signals"] = plain(facts), signals
+        record["facts"], record["signals"] = cast(Facts, plain(facts)), signals
         return self._kept(INGEST, key, {}, record) if keep else _unkept(record, key)
 
     def _signals_whole(self, record: Record) -> bool:

@@ -10,9 +10,8 @@ import stat
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from packaging.requirements import Requirement
 
@@ -30,7 +29,7 @@ LEAST_PYTHON = (3, 11)
 
 @dataclass(frozen=True)
 class Check:
-    """One thing looked at: what was found, and what to do unless it is ok."""
+    """One thing looked at: `status` ok, warning or failed, what was found, and what to do unless it is ok."""
 
     check: str
     status: str
@@ -38,15 +37,16 @@ class Check:
     advice: str | None = None
 
 
-def examine(root: Path, archive: Path | None = None) -> dict[str, Any]:
-    """Look at everything.
+@dataclass(frozen=True)
+class Examination:
+    """All that was looked at; `ok`: nothing failed."""
 
-    Returns
-    -------
-    dict
-        `ok` (nothing failed) and `checks`, a list of `{"check", "status", "found", "advice"}`; status is ok, warning or
-        failed.
-    """
+    ok: bool
+    checks: list[Check]
+
+
+def examine(root: Path, archive: Path | None = None) -> Examination:
+    """Look at everything."""
     checks = [
         *_versions(),
         *_root(root),
@@ -56,7 +56,7 @@ def examine(root: Path, archive: Path | None = None) -> dict[str, Any]:
         *_locks(root),
         _server(root),
     ]
-    return {"ok": all(check.status != FAILED for check in checks), "checks": [asdict(check) for check in checks]}
+    return Examination(all(check.status != FAILED for check in checks), checks)
 
 
 def _versions() -> Iterator[Check]:

@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
@@ -249,17 +249,19 @@ def doctor(
     archive
         Check that the logs of this archive can be read too.
     """
+    from dataclasses import asdict
+
     from fieldcal.cli.doctor import examine
     from fieldcal.cli.show import print_json
 
     result = examine(_root(warehouse), archive)
     if as_json:
-        print_json(result)
+        print_json(asdict(result))
     else:
-        for check in result["checks"]:
-            advice = f"\n{'':23}{check['advice']}" if check["advice"] else ""
-            print(f"{check['status']:8} {check['check']:14}{check['found']}{advice}")
-    return OK if result["ok"] else FAILED
+        for check in result.checks:
+            advice = f"\n{'':23}{check.advice}" if check.advice else ""
+            print(f"{check.status:8} {check.check:14}{check.found}{advice}")
+    return OK if result.ok else FAILED
 
 
 def main(tokens: Sequence[str] | None = None) -> None:
@@ -273,9 +275,9 @@ def run(tokens: Sequence[str]) -> int:
     """Run one command; its exit code. Errors are one sentence on stderr, unless FIELDCAL_DEBUG=1."""
     try:
         with interruptible():
-            code: Any = app(list(tokens), exit_on_error=False, print_error=False)
+            code: int | None = app(list(tokens), exit_on_error=False, print_error=False)
         sys.stdout.flush()
-        return OK if code is None else int(code)
+        return OK if code is None else code
     except CycloptsError as error:
         return _told(f"{' '.join(str(error).split())} (fieldcal --help)", USAGE)
     except KeyboardInterrupt:

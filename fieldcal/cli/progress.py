@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 from fieldcal.words.talk import say
 
@@ -19,7 +19,6 @@ class NightProgress:
 
     def __init__(self) -> None:
         self._bar: Progress | None = None
-        self._task: Any = None
         self._total = 0
         self._done = 0
 
@@ -33,14 +32,14 @@ class NightProgress:
 
             columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
             self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
-            self._task = self._bar.add_task("", total=flights)
+            self._bar.add_task("", total=flights)
             self._bar.start()
 
     def done(self, outcome: Outcome) -> None:
         """A flight is done."""
         self._done += 1
         if self._bar is not None:
-            self._bar.update(self._task, advance=1, description=outcome.job.log_uri)
+            self._bar.update(self._bar.task_ids[0], advance=1, description=outcome.job.log_uri)
         elif outcome.ran:
             from fieldcal.batch.outcome import cause
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
 import fieldcal
 from fieldcal.cli.options import AsJson, UnusedConfig, UnusedRoot
 from fieldcal.reason_codes import ReasonCode
+
+if TYPE_CHECKING:
+    from fieldcal.errors import FieldcalError
 
 OFF = Parameter(negative="")
 
@@ -168,7 +171,7 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
     return values
 
 
-def _wrong(sentence: str) -> Any:
+def _wrong(sentence: str) -> FieldcalError:
     from fieldcal.errors import FieldcalError
 
     return FieldcalError(ReasonCode.WRONG_OPTION, sentence)

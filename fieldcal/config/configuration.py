@@ -11,9 +11,10 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 from fieldcal.config.mistakes import configuration_error
 from fieldcal.config.parameters import PROFILES, Parameters
@@ -36,7 +37,7 @@ from fieldcal.config.values import (
     wrong,
 )
 from fieldcal.errors import ConfigurationError
-from fieldcal.names import SENSORS, Approach, Body, FieldUnit, GravitySign, ProfileName, World
+from fieldcal.names import SENSORS, Approach, Body, FieldUnit, GravitySign, Json, ProfileName, World
 from fieldcal.reason_codes import ReasonCode
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -44,7 +45,7 @@ FIELD_UNITS = ("norm", "T", "uT", "G")
 AnyTable = TypeVar("AnyTable", bound=Table)
 
 
-def _meaning(text: str, unit: str = "") -> Any:
+def _meaning(text: str, unit: str = "") -> FieldInfo:
     """What a key means, for people and for editors."""
     return Field(description=text, json_schema_extra={"unit": unit} if unit else None)
 
@@ -137,7 +138,7 @@ class Vehicle(VehicleTable):
     vehicle_id: str
     imu_id: str
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Json]:
         """Plain JSON of everything that can change results; names of vehicle and IMU do not, nor does the profile's."""
         return self.model_dump(mode="json", exclude={"vehicle_id", "imu_id", "profile"})
 

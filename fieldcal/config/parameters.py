@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeVar
 
 from pydantic import Field
 
@@ -10,9 +10,10 @@ from fieldcal.config.values import Table
 from fieldcal.names import AttitudeFit, EllipsoidFit, Equations, InitialAttitude, ProfileName, SegmentEnds
 
 Value = float | str | bool
+V = TypeVar("V", bound=Value)
 
 
-def parameter(default: Value, meaning: str, unit: str = "", *, within: tuple[float, float] | None = None) -> Any:
+def parameter(default: V, meaning: str, unit: str = "", *, within: tuple[float, float] | None = None) -> V:
     """A field with its default, its meaning, its unit and inclusive bounds."""
     lowest, highest = within or (None, None)
     return Field(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NotRequired, TypedDict
+from typing import NotRequired, TypedDict
 
 from fieldcal.logs.facts import Facts
 from fieldcal.names import Json
@@ -34,7 +34,7 @@ class StepRecord(TypedDict):
     status: str
     reason_code: str | None
     reason: str | None
-    measured: dict[str, Any]
+    measured: Mapping[str, Json]
     versions: dict[str, str]
     run_key: str | None
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -14,23 +13,11 @@ from fieldcal.flight.job import Job
 from fieldcal.flight.record import Refusal, StepRecord
 from fieldcal.logs import ingest
 from fieldcal.logs.facts import Facts, FindingFacts
-from fieldcal.names import Status, Verdict
+from fieldcal.names import Json, Status, Verdict
+from fieldcal.schemas.rows import FlightLead, FlightRow, RunRow
 from fieldcal.stages.pipeline import PUBLISHED
 from fieldcal.warehouse.store import empty_frame, frame
 
-FACTS = (
-    "duration_s",
-    "imu_rate_hz",
-    "vps_rate_hz",
-    "n_samples",
-    "temperature_min_degc",
-    "temperature_mean_degc",
-    "temperature_max_degc",
-    "verdict",
-    "reason_code",
-    "reason",
-    "verifiable",
-)
 LEAD_SCHEMA = pl.Schema(
     {
         "flight_id": pl.String(),
@@ -45,7 +32,7 @@ StageTables = Mapping[str, tuple[pl.DataFrame, str | None]]
 """`stage.table` → its rows and the run_key that made them."""
 
 
-def lead(job: Job, imu_id: str, facts: Facts) -> dict[str, Any]:
+def lead(job: Job, imu_id: str, facts: Facts) -> FlightLead:
     """What leads every row of the history."""
     return {
         "flight_id": job.flight_id,
@@ -56,20 +43,29 @@ def lead(job: Job, imu_id: str, facts: Facts) -> dict[str, Any]:
     }
 
 
-def flight_row(job: Job, leading: Mapping[str, Any], facts: Facts) -> dict[str, Any]:
+def flight_row(job: Job, leading: FlightLead, facts: Facts) -> FlightRow:
     """The row of `flight`."""
-    known: Mapping[str, object] = facts
     return {
         **leading,
         "log_uri": job.log_uri,
         "log_sha256": job.sha256,
         "log_format": job.log_format,
-        **{name: known[name] for name in FACTS},
+        "duration_s": facts["duration_s"],
+        "imu_rate_hz": facts["imu_rate_hz"],
+        "vps_rate_hz": facts["vps_rate_hz"],
+        "n_samples": facts["n_samples"],
+        "temperature_min_degc": facts["temperature_min_degc"],
+        "temperature_mean_degc": facts["temperature_mean_degc"],
+        "temperature_max_degc": facts["temperature_max_degc"],
+        "verdict": facts["verdict"],
+        "reason_code": facts["reason_code"],
+        "reason": facts["reason"],
+        "verifiable": facts["verifiable"],
         "findings": _json(facts["findings"]),
     }
 
 
-def run_rows(leading: Mapping[str, Any], records: Mapping[str, StepRecord]) -> list[dict[str, Any]]:
+def run_rows(leading: FlightLead, records: Mapping[str, StepRecord]) -> list[RunRow]:
     """Rows of `run`, one a step. The sentence of a refusal stands among the measured numbers, as `reason`."""
     return [
         {
@@ -87,9 +83,8 @@ def run_rows(leading: Mapping[str, Any], records: Mapping[str, StepRecord]) -> l
 
 def judged(facts: Facts, records: Mapping[str, StepRecord]) -> Facts:
     """The facts with what the stages found: a stage that failed makes an `ok` log `partial`, faults are findings."""
-    faults = [fault for record in records.values() for fault in record["measured"].get("faults", [])]
-    told: list[FindingFacts] = [{"code": fault["code"], "count": 1, "sentence": fault["sentence"]} for fault in faults]
-    facts = {**facts, "findings": [*facts["findings"], *told]}
+    faults = [fault for record in records.values() for fault in _faults(record["measured"])]
+    facts = {**facts, "findings": [*facts["findings"], *faults]}
     failed = [record for record in records.values() if record["status"] == Status.FAILED]
     if facts["verdict"] == Verdict.OK and failed:
         return {
@@ -110,7 +105,7 @@ def refusals(records: Mapping[str, StepRecord]) -> list[Refusal]:
     ]
 
 
-def published_tables(flights: Sequence[tuple[Mapping[str, Any], StageTables]]) -> dict[str, pl.DataFrame]:
+def published_tables(flights: Sequence[tuple[FlightLead, StageTables]]) -> dict[str, pl.DataFrame]:
     """`calibration`, `fit` and `sync` of flights, each its `lead` and its stages' tables."""
     result = {}
     for table, sources in PUBLISHED.items():
@@ -136,5 +131,15 @@ def rows_frame(table: str, rows: Sequence[Mapping[str, object]]) -> pl.DataFrame
     return pl.DataFrame(rows, schema=empty.schema, strict=False) if rows else empty
 
 
-def _json(value: Any) -> str:
+def _faults(measured: Mapping[str, Json]) -> list[FindingFacts]:
+    """The faults that a stage found, as findings of the log."""
+    listed = measured.get("faults")
+    return [
+        {"code": str(fault["code"]), "count": 1, "sentence": str(fault["sentence"])}
+        for fault in (listed if isinstance(listed, Sequence) else ())
+        if isinstance(fault, Mapping)
+    ]
+
+
+def _json(value: object) -> str:
     return json.dumps(value, sort_keys=True, ensure_ascii=False, allow_nan=False)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fieldcal.geometry.intervals import interval_of, share_of_interval
 
-Array = NDArray[np.floating[Any]]  # of any width, because numpy.linalg's answers are so to the type check
+Array = NDArray[np.floating]  # of any width, because numpy.linalg's answers are so to the type check
 
 IDENTITY = np.broadcast_to(np.array([0.0, 0.0, 0.0, 1.0]), 4)
 """The quaternion of no rotation; read-only, as every user has the same one."""

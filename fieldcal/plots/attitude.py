@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fieldcal.geometry.rotation import Array, continuous, euler_angles
-from fieldcal.plots.panels import COLOURS, curve, legend, listed, panels, three
+from fieldcal.plots.panels import COLOURS, curve, legend, stacked, three
 from fieldcal.plots.panels import unit as plain_unit
 from fieldcal.report.plot import without_wraps
 
@@ -21,7 +21,7 @@ def plot_attitude_error(t: Array, rate: Array, error: Array, stretch: Array, tit
     runs from one `stretch` (n,) of integration to the next."""
     degrees = np.degrees(error)
     degrees[1:][stretch[1:] != stretch[:-1]] = np.nan
-    axes = panels(2, title=title, height_in=5.0, sharex=True)[:, 0]
+    axes = stacked(2, title=title, height_in=5.0, sharex=True)
     three(axes[0], t, rate)
     axes[0].set_ylabel("calibrated rate (rad/s)")
     three(axes[1], t, degrees, ("about north", "east", "down"))
@@ -29,13 +29,13 @@ def plot_attitude_error(t: Array, rate: Array, error: Array, stretch: Array, tit
     axes[1].set_xlabel("time (s)")
     for axis in axes:
         legend(axis)
-    return listed(axes)
+    return axes
 
 
 def plot_joint(t: Array, q: Array, lengths: Mapping[str, tuple[Array, Array, float, str]], title: str) -> list[Axes]:
     """Attitude q (n, 4) of the sensor axes as Euler angles, and each vector triad's calibrated length: sensor →
     (stamps (k,), lengths (k,), the length it should have, its unit)."""
-    axes = panels(1 + len(lengths), title=title, height_in=2.0 * (1 + len(lengths)) + 0.8, sharex=True)[:, 0]
+    axes = stacked(1 + len(lengths), title=title, height_in=2.0 * (1 + len(lengths)) + 0.8, sharex=True)
     angles = euler_angles(continuous(q))
     for i, name in enumerate(("bank φ", "pitch θ", "heading ψ")):
         curve(axes[0], t, np.degrees(without_wraps(angles[:, i])), COLOURS[i], name)
@@ -46,4 +46,4 @@ def plot_joint(t: Array, q: Array, lengths: Mapping[str, tuple[Array, Array, flo
         axis.axhline(wanted, color="k", linewidth=1.0, linestyle="--")
         axis.set_ylabel(f"{name},\nlength ({plain_unit(unit)})")
     axes[-1].set_xlabel("time (s)")
-    return listed(axes)
+    return axes

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fieldcal.geometry.rotation import Array
-from fieldcal.plots.panels import COLOURS, REFUSED, curve, legend, listed, panels, three, told, unit
+from fieldcal.plots.panels import COLOURS, REFUSED, curve, legend, panels, three, told, unit
 from fieldcal.report.words import plain_name
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class SensorPlot:
 def plot_calibration(sensors: Sequence[SensorPlot], title: str) -> list[Axes]:
     """A column a sensor: readings above, scales below."""
     axes = panels(2, len(sensors), title=title, height_in=6.0, width_in=11.0)
-    for (above, below), sensor in zip(axes.T, sensors, strict=True):
+    for above, below, sensor in zip(*axes, sensors, strict=True):
         above.set_title(sensor.sensor if sensor.used is None else f"{sensor.sensor}, {plain_name(sensor.used)}")
         if sensor.t is None or sensor.z is None or not np.isfinite(sensor.z).any():
             told(above, f"Refused: {sensor.refused}" if sensor.refused else "There is nothing to show.")
@@ -49,7 +50,7 @@ def plot_calibration(sensors: Sequence[SensorPlot], title: str) -> list[Axes]:
         _scales(below, sensor)
     for axis in axes[0]:
         axis.title.set_fontsize("medium")
-    return listed(axes)
+    return [axis for axis in chain.from_iterable(axes) if axis.get_visible()]
 
 
 def _readings(axis: Axes, s: SensorPlot) -> None:

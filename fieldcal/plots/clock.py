@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fieldcal.geometry.rotation import Array
-from fieldcal.plots.panels import COLOURS, curve, legend, listed, panels
+from fieldcal.plots.panels import COLOURS, curve, legend, stacked
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,7 +19,7 @@ LIVELIEST_SHARE = 0.999
 
 def plot_clock(imu: tuple[Array, Array], vps: tuple[Array, Array], title: str, *, unit: str = "rad/s") -> list[Axes]:
     """Rates of both, (stamps (n,) s on the IMU's clock, rates (n, 3)): the whole record, and its liveliest second."""
-    axes = panels(2, title=title, height_in=5.0)[:, 0]
+    axes = stacked(2, title=title, height_in=5.0)
     lengths = [(t, np.linalg.norm(rate, axis=1)) for t, rate in (imu, vps)]
     own_t, own = lengths[1]
     known = np.isfinite(own)
@@ -36,4 +36,4 @@ def plot_clock(imu: tuple[Array, Array], vps: tuple[Array, Array], title: str, *
     axes[1].set_xlim(moment - AROUND_S, moment + AROUND_S)
     axes[1].set_xlabel("time, IMU clock (s)")
     legend(axes[0])
-    return listed(axes)
+    return axes

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from datetime import timedelta
-from typing import TYPE_CHECKING, Any
+from itertools import chain
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
-from fieldcal.plots.panels import COLOURS, REFUSED, legend, listed, panels, unit
+from fieldcal.geometry.rotation import Array
+from fieldcal.plots.panels import COLOURS, REFUSED, legend, panels, stacked, unit
+from fieldcal.report.plot import Across
 from fieldcal.report.trend import predicted
 from fieldcal.report.words import plain_name, preferred
 from fieldcal.schemas.reference import REFERENCE_DEGC
@@ -45,16 +48,15 @@ def plot_frame(frame: pl.DataFrame, sensor: str | None, parameter: str | None) -
 def plot_history(rows: pl.DataFrame, title: str) -> list[Axes]:
     """Rows of one sensor and parameter, a panel an axis, a colour an IMU: values ±1 sd over the flights."""
     names = sorted(rows["axis"].unique().to_list())
-    axes = panels(len(names), title=title, sharex=True)[:, 0]
+    axes = stacked(len(names), title=title, sharex=True)
     identity = "imu_id" if "imu_id" in rows.columns else "method"
     shown = rows[identity].unique(maintain_order=True).to_list()
     for axis, name in zip(axes, names, strict=True):
         here = rows.filter(pl.col("axis") == name)
         for number, own in enumerate(shown[:MOST_CURVES]):
             part = here.filter(pl.col(identity) == own, pl.col("status") == "ok", pl.col("value").is_not_null())
-            style: dict[str, Any] = {"fmt": "o", "ms": 4, "lw": 1.0, "capsize": 2, "color": COLOURS[number]}
-            sd = part["sd"].fill_null(0.0).to_numpy()
-            axis.errorbar(_x(part, rows), part["value"].to_numpy(), sd, label=str(own), **style)
+            y, sd = part["value"].to_numpy(), part["sd"].fill_null(0.0).to_numpy()
+            _bars(axis, _x(part, rows), y, sd, COLOURS[number], str(own))
         limits = axis.get_ylim()
         refused = here.filter(pl.col("status") != "ok", pl.col("value").is_not_null())
         axis.plot(_x(refused, rows), refused["value"].to_numpy(), "x", ms=5, color=REFUSED)
@@ -64,7 +66,7 @@ def plot_history(rows: pl.DataFrame, title: str) -> list[Axes]:
     _when(axes[-1], rows)
     if len(shown) > 1:
         legend(axes[0], MOST_CURVES // 2)
-    return listed(axes)
+    return axes
 
 
 def plot_drift(rows: pl.DataFrame, title: str) -> list[Axes]:
@@ -84,10 +86,11 @@ def plot_drift(rows: pl.DataFrame, title: str) -> list[Axes]:
                 _trend_over_temperature(warm, row, colour)
         in_time.set_ylabel(f"{name} at 25 °C ({unit(rows['unit'][0])})")
         legend(in_time, 3)
-    _dates(axes[-1, 0])
-    axes[-1, 0].set_xlabel("date")
-    axes[-1, 1].set_xlabel("temperature (°C)")
-    return listed(axes)
+    in_time, warm = axes[-1]
+    _dates(in_time)
+    in_time.set_xlabel("date")
+    warm.set_xlabel("temperature (°C)")
+    return list(chain.from_iterable(axes))
 
 
 def plot_agreement(rows: pl.DataFrame) -> list[Axes]:
@@ -113,26 +116,25 @@ def plot_agreement(rows: pl.DataFrame) -> list[Axes]:
     for i, row in enumerate(lines):
         axes[1].text(row["rms"], i, f" {row['rms']:.3g} {unit(row['rms_unit'])}", va="center", fontsize="x-small")
     axes[1].margins(x=0.25)
-    return listed(axes)
+    return axes
 
 
 def _agreement_over_flights(rows: pl.DataFrame) -> list[Axes]:
     smoothed = rows.filter(pl.col("signal") == "smoothed", pl.col("sample") == "all")
     keys = smoothed.select("quantity", "method", "reference").unique(maintain_order=True).rows()
-    axes = panels(2, title="Agreement over the flights, smoothed readings", height_in=6.0, sharex=True)[:, 0]
+    axes = stacked(2, title="Agreement over the flights, smoothed readings", height_in=6.0, sharex=True)
     for number, (quantity, method, reference) in enumerate(keys[:MOST_CURVES]):
         own = smoothed.filter(quantity=quantity, method=method, reference=reference)
-        style: dict[str, Any] = {"marker": "o", "ms": 3.5, "ls": "none", "color": COLOURS[number]}
         label = f"{plain_name(quantity)}, {plain_name(method)} / {plain_name(reference)}"
-        axes[0].plot(_x(own, rows), own["tic"].to_numpy(), label=label, **style)
+        _dots(axes[0], _x(own, rows), own["tic"].to_numpy(), COLOURS[number], label)
         if own["rms_unit"][0] == "deg":
-            axes[1].plot(_x(own, rows), own["rms"].to_numpy(), **style)
+            _dots(axes[1], _x(own, rows), own["rms"].to_numpy(), COLOURS[number])
     axes[0].set_ylabel("Theil coefficient (1)")
     axes[0].set_yscale("log")
     axes[1].set_ylabel("rms attitude error (°)")
     axes[0].legend(fontsize="x-small", frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     _when(axes[1], rows)
-    return listed(axes)
+    return axes
 
 
 def plot_clocks(rows: pl.DataFrame) -> list[Axes]:
@@ -140,16 +142,16 @@ def plot_clocks(rows: pl.DataFrame) -> list[Axes]:
     good = rows.filter(pl.col("status") == "ok", pl.col("lag_mid_s").is_not_null())
     if good.is_empty():
         raise ValueError("no flight of the frame has a VPS clock that was not refused")
-    axes = panels(2, title="Clock of the VPS: VPS clock + lag = IMU clock", height_in=5.0, sharex=True)[:, 0]
+    axes = stacked(2, title="Clock of the VPS: VPS clock + lag = IMU clock", height_in=5.0, sharex=True)
     for axis, value, sd, factor, label in (
         (axes[0], "lag_mid_s", "lag_sd_s", 1e3, "lag at mid-flight (ms)"),
         (axes[1], "skew_ppm", "skew_sd_ppm", 1.0, "drift (ppm)"),
     ):
         y, bar = factor * good[value].to_numpy(), factor * good[sd].fill_null(0.0).to_numpy()
-        axis.errorbar(_x(good, good), y, bar, fmt="o", ms=4, lw=1.0, capsize=2, color=COLOURS[0])
+        _bars(axis, _x(good, good), y, bar, COLOURS[0])
         axis.set_ylabel(label)
     _when(axes[1], good)
-    return listed(axes)
+    return axes
 
 
 def _chosen(frame: pl.DataFrame, sensor: str | None, parameter: str | None) -> tuple[pl.DataFrame, str]:
@@ -174,6 +176,8 @@ def _chosen(frame: pl.DataFrame, sensor: str | None, parameter: str | None) -> t
 
 def _trend_in_time(axis: Axes, row: DriftRow, colour: str, label: str) -> None:
     """From the step, or as long before the mean flight as the last one is after it, to the last flight."""
+    from matplotlib.dates import date2num
+
     as_of, level = row["as_of"], row["value_at_25degc"]
     if as_of is None:
         axis.plot([], [], color=colour, label=label)
@@ -185,8 +189,7 @@ def _trend_in_time(axis: Axes, row: DriftRow, colour: str, label: str) -> None:
         span = max(2.0 * (as_of - row["best_known_at"]).total_seconds() / 86400.0, 1.0)
     if row["change_at"] is not None:
         span = min(span, (as_of - row["change_at"]).total_seconds() / 86400.0)
-        step: Any = row["change_at"]  # a moment, which matplotlib takes and its types do not
-        axis.axvline(step, color=colour, linestyle=":", linewidth=1.2)
+        axis.axvline(date2num(row["change_at"]), color=colour, linestyle=":", linewidth=1.2)
     days = np.linspace(-span, 0.0, 60)
     value, sd = predicted(row, REFERENCE_DEGC, days)
     x = np.array([as_of + timedelta(days=float(d)) for d in days])
@@ -205,17 +208,25 @@ def _trend_over_temperature(axis: Axes, row: DriftRow, colour: str) -> None:
     _band(axis, degc, value, sd, colour, None)
 
 
-def _band(axis: Axes, x: Any, value: Any, sd: Any, colour: str, label: str | None) -> None:
+def _dots(axis: Axes, x: Across, y: Array, colour: str, label: str | None = None) -> None:
+    axis.plot(x, y, marker="o", ms=3.5, ls="none", color=colour, label=label)
+
+
+def _bars(axis: Axes, x: Across, y: Array, sd: Array, colour: str, label: str | None = None) -> None:
+    axis.errorbar(x, y, sd, fmt="o", ms=4, lw=1.0, capsize=2, color=colour, label=label)
+
+
+def _band(axis: Axes, x: Across, value: Array, sd: Array, colour: str, label: str | None) -> None:
     axis.fill_between(x, value - SIGMAS * sd, value + SIGMAS * sd, color=colour, alpha=0.15, linewidth=0)
     axis.plot(x, value, color=colour, linewidth=1.4, label=label)
 
 
-def _x(part: pl.DataFrame, whole: pl.DataFrame) -> Any:
+def _x(part: pl.DataFrame, whole: pl.DataFrame) -> Across:
     """Dates where every flight of the whole frame has one, else the flight's number."""
     if _dated(whole):
         return part["started_at"].dt.convert_time_zone("UTC").dt.replace_time_zone(None).to_numpy()
     if "flight_id" not in whole.columns:
-        return np.arange(part.height)
+        return np.arange(part.height, dtype=float)
     number = {flight: i for i, flight in enumerate(whole["flight_id"].unique(maintain_order=True).to_list(), start=1)}
     return np.array([number[flight] for flight in part["flight_id"].to_list()])
 
@@ -236,7 +247,6 @@ def _when(axis: Axes, rows: pl.DataFrame) -> None:
 def _dates(axis: Axes) -> None:
     from matplotlib import dates
 
-    ticks: Any = dates
-    locator = ticks.AutoDateLocator(minticks=3, maxticks=8)
+    locator = dates.AutoDateLocator(minticks=3, maxticks=8)
     axis.xaxis.set_major_locator(locator)
-    axis.xaxis.set_major_formatter(ticks.ConciseDateFormatter(locator))
+    axis.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))

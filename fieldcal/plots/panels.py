@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from itertools import chain
+from typing import TYPE_CHECKING, Literal
 
 from fieldcal.geometry.rotation import Array
 from fieldcal.report.plot import thinned, with_gaps
@@ -24,20 +23,29 @@ def panels(
     title: str = "",
     height_in: float | None = None,
     width_in: float = WIDTH_IN,
-    **shared: Any,
-) -> Any:
-    """A new figure's axes, (rows, columns)."""
+    sharex: bool | Literal["col"] = False,
+    sharey: bool = False,
+) -> list[list[Axes]]:
+    """A new figure's axes, by row."""
     from matplotlib import pyplot
 
     size = (width_in, height_in or ROW_IN * rows + 0.6)
-    figure, axes = pyplot.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **shared)
+    figure, grid = pyplot.subplots(
+        rows, columns, figsize=size, squeeze=False, layout="constrained", sharex=sharex, sharey=sharey
+    )
+    axes: list[list[Axes]] = grid.tolist()
     if title:
         figure.suptitle(title, fontsize="medium", parse_math=False)
-    for axis in axes.flat:
+    for axis in chain.from_iterable(axes):
         axis.grid(True, alpha=0.3, linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
         axis.ticklabel_format(axis="y", useOffset=False, scilimits=(-3, 5))
     return axes
+
+
+def stacked(rows: int, *, title: str, height_in: float | None = None, sharex: bool = False) -> list[Axes]:
+    """A new figure's axes, one below the other."""
+    return [axis for (axis,) in panels(rows, title=title, height_in=height_in, sharex=sharex)]
 
 
 def three(axis: Axes, t: Array, x: Array, names: tuple[str, ...] = ("x", "y", "z"), *, dashes: str = "-") -> None:
@@ -55,8 +63,16 @@ def curve(
 
 def legend(axis: Axes, columns: int = 4) -> None:
     """Name the curves above the panel's right corner, where none of them is."""
-    place: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.98), "borderaxespad": 0.0}
-    axis.legend(ncols=columns, fontsize="small", frameon=False, handlelength=1.4, columnspacing=1.2, **place)
+    axis.legend(
+        loc="lower right",
+        bbox_to_anchor=(1.0, 0.98),
+        borderaxespad=0.0,
+        ncols=columns,
+        fontsize="small",
+        frameon=False,
+        handlelength=1.4,
+        columnspacing=1.2,
+    )
 
 
 def told(axis: Axes, sentence: str) -> None:
@@ -65,11 +81,6 @@ def told(axis: Axes, sentence: str) -> None:
 
     axis.set_axis_off()
     axis.text(0.5, 0.5, textwrap.fill(sentence, 34), ha="center", va="center", fontsize="small", parse_math=False)
-
-
-def listed(axes: Any) -> list[Axes]:
-    """Axes row by row, those in use."""
-    return [axis for axis in np.asarray(axes).flat if axis.get_visible()]
 
 
 def unit(text: str) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from fieldcal.errors import FieldcalError
-from fieldcal.plots.panels import COLOURS, curve, legend, listed, panels, three, unit
+from fieldcal.plots.panels import COLOURS, curve, legend, stacked, three, unit
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.tables import QUATERNION, matrix, seconds, triad
 
@@ -36,7 +36,7 @@ def plot_signals(
             ReasonCode.NOT_USABLE, f"There is nothing to plot: {reason or 'the recording has no readings.'}"
         )
     rows = len(shown) + len(single) + poses
-    axes = panels(rows, title=title if reason is None else f"{title}\n{reason}", height_in=1.6 * rows + 0.8)[:, 0]
+    axes = stacked(rows, title=title if reason is None else f"{title}\n{reason}", height_in=1.6 * rows + 0.8)
     origin = int(signals["imu"]["t_ns"][0])
     for axis, (name, table) in zip(axes, shown, strict=False):
         frame = signals[table]
@@ -59,7 +59,7 @@ def plot_signals(
         axes[-1].set_ylabel("VPS quaternion\n(1)")
         axes[-1].set_xlabel("time from the first pose, VPS clock (s)")
         legend(axes[-1])
-    return listed(axes)
+    return axes
 
 
 def _any(table: pl.DataFrame | None, column: str) -> bool:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fieldcal.geometry.rotation import Array
-from fieldcal.plots.panels import COLOURS, listed, panels
+from fieldcal.plots.panels import COLOURS, panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,4 +30,4 @@ def plot_sphere(z: Array, magnitude: float, title: str) -> list[Axes]:
     axes[1].set(xlim=(-180, 180), ylim=(-1, 1), xticks=range(-180, 181, 90))
     axes[1].set_xlabel("azimuth about the sensor's z (°)")
     axes[1].set_ylabel("sine of elevation above its xy-plane")
-    return listed(axes)
+    return axes

@@ -13,7 +13,6 @@ import importlib.metadata
 import inspect
 import json
 from collections.abc import Callable, Mapping
-from typing import Any
 
 from fieldcal.names import Json
 from fieldcal.provenance.reached_code import reach_digest
@@ -75,7 +74,7 @@ def code_digest() -> str:
     return digest.hexdigest()
 
 
-def source_digest(*functions: Callable[..., Any]) -> str:
+def source_digest(*functions: Callable[..., object]) -> str:
     """32 hex digits of the source that functions of the project reach, as it was when it was first read.
 
     Parameters
@@ -91,7 +90,7 @@ def source_digest(*functions: Callable[..., Any]) -> str:
     return reach_digest(installed(PROJECT), [dotted_name(function) for function in functions])
 
 
-def dotted_name(function: Callable[..., Any]) -> str:
+def dotted_name(function: Callable[..., object]) -> str:
     """Module and name of what `functools.wraps` and `functools.partial` wrap."""
     target = inspect.unwrap(function.func if isinstance(function, functools.partial) else function)
     return f"{target.__module__}.{target.__qualname__}"

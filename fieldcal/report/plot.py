@@ -11,9 +11,10 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import numpy.typing as npt
 from markupsafe import Markup, escape
 
 from fieldcal.geometry.rotation import Array
@@ -22,12 +23,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.typing import RcKeyType
+    from mpl_toolkits.mplot3d import Axes3D
 
 INK = {
     name: f"#fe01{number:02x}"
     for number, name in enumerate(("fg", "muted", "line", "c1", "c2", "c3", "c4", "warn"), start=1)
 }
 """Colours to draw with, by the name of the CSS variable that stands in their place on the page."""
+
+Across = Array | npt.NDArray[np.datetime64] | npt.NDArray[np.object_]
+"""Where points lie along an axis, (n,): numbers, or moments."""
 
 XYZ = (INK["c1"], INK["c2"], INK["c3"])
 BUCKETS = 500
@@ -109,13 +114,12 @@ def panels(
     return figure, axes
 
 
-def solid_panels(columns: int, *, height_in: float) -> tuple[Figure, list[Any]]:
+def solid_panels(columns: int, *, height_in: float) -> tuple[Figure, list[Axes3D]]:
     """A figure of the page's width with three-dimensional panels."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(_WIDTH_IN, height_in))
-    # Any: matplotlib has no types of its three-dimensional axes.
-    axes: list[Any] = [figure.add_subplot(1, columns, i + 1, projection="3d") for i in range(columns)]
+    axes: list[Axes3D] = [figure.add_subplot(1, columns, i + 1, projection="3d") for i in range(columns)]
     for axis in axes:
         for own in (axis.xaxis, axis.yaxis, axis.zaxis):
             own.set_pane_color((0, 0, 0, 0))

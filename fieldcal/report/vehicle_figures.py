@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import datetime, timedelta
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,7 @@ import polars as pl
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Status
 from fieldcal.report.page import Plot
-from fieldcal.report.plot import INK, XYZ, headed, legend_below, panels, svg
+from fieldcal.report.plot import INK, XYZ, Across, headed, legend_below, panels, svg
 from fieldcal.report.trend import days_after, predicted, warmed
 from fieldcal.report.words import count, day, unit
 from fieldcal.schemas.reference import REFERENCE_DEGC
@@ -28,9 +28,6 @@ MOST_POINTS = 250
 SIGMAS = 2.0
 MARGIN = 0.15
 _ROW_IN = 1.35
-
-Across = Array | npt.NDArray[np.datetime64] | npt.NDArray[np.object_]
-"""Where points lie along an axis, (n,): numbers, or moments."""
 
 
 TOLD = {
@@ -77,6 +74,8 @@ def parameter_plot(
 
 def _panel_row(axes: list[Axes], rows: pl.DataFrame, trend: DriftRow | None, vehicle_id: str) -> set[str]:
     """One axis; what its caption has to tell."""
+    from matplotlib.dates import date2num
+
     trend = None if trend is None or trend["value_at_25degc"] is None else trend
     told = {"plain" if trend is None else "trend"}
     moments: list[datetime | None] = rows["started_at"].to_list()
@@ -113,8 +112,7 @@ def _panel_row(axes: list[Axes], rows: pl.DataFrame, trend: DriftRow | None, veh
         warm = np.linspace(known.min(), known.max(), 60)
         _band(axes[1], warm, predicted(trend, warm, 0.0))
     if changed is not None and dated:
-        # Moments are taken too, which matplotlib's types do not say.
-        axes[0].axvline(changed, color=INK["warn"], linewidth=1.0, linestyle=(0, (4, 2)))  # type: ignore[arg-type]
+        axes[0].axvline(date2num(changed), color=INK["warn"], linewidth=1.0, linestyle=(0, (4, 2)))
     if dated:
         _dates(axes[0])
     else:
@@ -193,10 +191,9 @@ def _band(axis: Axes, x: Across, line: tuple[Array, Array]) -> None:
 def _dates(axis: Axes) -> None:
     from matplotlib import dates
 
-    ticks: Any = dates  # matplotlib has no types of this module
-    locator = ticks.AutoDateLocator(minticks=3, maxticks=7)
+    locator = dates.AutoDateLocator(minticks=3, maxticks=7)
     axis.xaxis.set_major_locator(locator)
-    axis.xaxis.set_major_formatter(ticks.ConciseDateFormatter(locator))
+    axis.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
 
 
 def _x_of(moments: list[datetime | None]) -> tuple[Across, bool]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -208,16 +209,20 @@ def _output_error(tables: Tables, s: GyroOutputSettings) -> StageResult:
     q = sensor_attitude(matrix(attitude, QUATERNION), s)
     start = _start(tables["gyroscope"], t, q, logged, segment, weight, s)
     stretch_s = s.shooting_s or _suitable_stretch(start, t, logged, tables)
-    options: dict[str, Any] = {
-        "segment": segment,
-        "weights": weight,
-        "initial_attitude": s.initial_attitude,
-        "robust": s.initial_attitude == "estimated",
-    }
+    fit_from = partial(
+        output_error.fit_output_error,
+        t,
+        q,
+        logged,
+        segment=segment,
+        weights=weight,
+        initial_attitude=s.initial_attitude,
+        robust=s.initial_attitude == "estimated",
+    )
     try:
         if stretch_s > 1.5 * RUN_IN_STRETCH_S and s.initial_attitude == "estimated":
-            start = output_error.fit_output_error(t, q, logged, start, stretch_s=RUN_IN_STRETCH_S, **options)
-        fit = output_error.fit_output_error(t, q, logged, start, stretch_s=stretch_s, **options)
+            start = fit_from(start, stretch_s=RUN_IN_STRETCH_S)
+        fit = fit_from(start, stretch_s=stretch_s)
     except EstimationError as error:
         return refusal(error, "gyroscope")
     median = output_error.attitude_error_median(t, q, fit.scale * logged + fit.bias, segment, stretch_s, weight)

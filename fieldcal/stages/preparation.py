@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from fieldcal.estimation import motion_selection, smoothing
 from fieldcal.estimation.segments import run_bounds
@@ -24,6 +25,15 @@ SHORTEST_STRETCH = 10
 MAGNETOMETER_PAUSE_S = 0.1
 MAGNETOMETER_PAUSE = 5.0
 """A magnetometer is interpolated over so many of its intervals, and over MAGNETOMETER_PAUSE_S, at the most."""
+
+
+class _Stretch(NamedTuple):
+    """Samples without a pause: stamps and number of the segment (n,), readings logged and smoothed (n, 9)."""
+
+    t_ns: NDArray[np.int64]
+    segment: NDArray[np.int32]
+    logged: Array
+    smoothed: Array
 
 
 def find_manoeuvre(tables: Tables, s: ManoeuvreSettings) -> StageResult:
@@ -88,7 +98,7 @@ def smooth(tables: Tables, s: SmoothingSettings) -> StageResult:
     logged = np.column_stack(
         [matrix(imu, triad("gyroscope") + triad("accelerometer")), _magnetometer_at(tables, stamps)]
     )
-    parts: list[dict[str, Any]] = []
+    parts: list[_Stretch] = []
     for number, rows in _whole_stretches(segments, stamps, logged):
         x = logged[rows]
         t = (stamps[rows] - origin) * 1e-9
@@ -97,19 +107,19 @@ def smooth(tables: Tables, s: SmoothingSettings) -> StageResult:
         smoothed[:, valid] = smoothing.smooth_samples(
             t, x[:, valid], s.smoothing_cutoff_hz, side_s=s.smoothing_side_s, ends=s.smoothing_ends
         )
-        parts.append({"t_ns": stamps[rows], "segment": np.full(len(x), number, dtype=np.int32), "x": x, "s": smoothed})
+        parts.append(_Stretch(stamps[rows], np.full(len(x), number, dtype=np.int32), x, smoothed))
     if not parts:
         return StageResult(
             status=Status.REFUSED, reason_code=ReasonCode.NO_MANOEUVRE, reason="The magnetometer pauses throughout."
         )
-    joined = {k: np.concatenate([p[k] for p in parts]) for k in ("t_ns", "segment", "x", "s")}
+    t_ns, segment, x, smoothed = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
     names = triad("gyroscope") + triad("accelerometer") + triad("magnetometer")
     samples = pl.DataFrame(
         {
-            "t_ns": joined["t_ns"],
-            "segment": joined["segment"],
-            **columns_of(joined["x"], names),
-            **columns_of(joined["s"], [f"smoothed_{n}" for n in names]),
+            "t_ns": t_ns,
+            "segment": segment,
+            **columns_of(x, names),
+            **columns_of(smoothed, [f"smoothed_{n}" for n in names]),
         }
     ).with_columns(pl.selectors.float().fill_nan(None))
     return StageResult({"samples": samples}, measured={"n_samples": len(samples)})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TypedDict, cast, overload
 
 import numpy as np
 import polars as pl
@@ -44,16 +44,28 @@ FAULT_SCHEMA = {
 }
 
 
+class FaultRow(TypedDict):
+    """A row of `faults`."""
+
+    sensor: str
+    axis: str
+    reason_code: str
+    number: float
+    limit: float
+    fatal: bool
+    reason: str
+
+
 def fault_rows(faults: Sequence[Fault]) -> pl.DataFrame:
     """Faults as the table `faults`."""
     rows = [(f.sensor, f.axis, f.code, f.value, f.limit, f.fatal, f.sentence) for f in faults]
     return pl.DataFrame(rows, schema=FAULT_SCHEMA, orient="row")
 
 
-def fatal_fault(faults: pl.DataFrame, sensors: tuple[str, ...]) -> dict[str, Any] | None:
+def fatal_fault(faults: pl.DataFrame, sensors: tuple[str, ...]) -> FaultRow | None:
     """The first fatal row of `faults` that concerns one of `sensors`, or None."""
     found = faults.filter(pl.col("fatal") & pl.col("sensor").is_in(list(sensors)))
-    return found.row(0, named=True) if found.height else None
+    return cast(FaultRow, found.row(0, named=True)) if found.height else None
 
 
 def triad_rows(
@@ -149,8 +161,18 @@ def zero_slope_rows(
     ]
 
 
-def plain(value: Any) -> Any:
-    """Plain JSON of a value: numpy numbers become Python's, what is not finite becomes None."""
+@overload
+def plain(value: Mapping[str, object]) -> dict[str, Json]: ...
+@overload
+def plain(value: object) -> Json: ...
+def plain(value: object) -> Json:
+    """Plain JSON of a value: numpy numbers become Python's, what is not finite becomes None.
+
+    Raises
+    ------
+    TypeError
+        JSON has no word for it.
+    """
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -159,4 +181,6 @@ def plain(value: Any) -> Any:
         return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    return value
+    if value is None or isinstance(value, str | float | int):
+        return value
+    raise TypeError(f"{type(value).__name__} has no place in plain JSON")

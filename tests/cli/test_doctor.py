@@ -18,8 +18,8 @@ from fieldcal.cli.main import run
 from fieldcal.warehouse.layout import lock_path, prepare
 
 
-def checks(root: Path, archive: Path | None = None) -> dict[str, dict[str, Any]]:
-    return {check["check"]: check for check in doctor.examine(root, archive)["checks"]}
+def checks(root: Path, archive: Path | None = None) -> dict[str, doctor.Check]:
+    return {check.check: check for check in doctor.examine(root, archive).checks}
 
 
 @pytest.fixture(autouse=True)
@@ -45,25 +45,25 @@ def test_versions_are_held_against_what_was_tested(tmp_path: Path, monkeypatch: 
     wanted = ["numpy>=2.4,<3", "scipy>=999", "no-such-library>=1", 'mypy>=1; extra == "test"']
     monkeypatch.setattr(importlib.metadata, "requires", lambda _: wanted)
     found = checks(tmp_path)
-    assert found["numpy"]["status"] == "ok"
-    assert found["scipy"]["status"] == "warning"
-    assert "tested with >=999" in found["scipy"]["found"]
-    assert found["no-such-library"]["status"] == "failed"
-    assert found["no-such-library"]["advice"] == "pip install 'no-such-library>=1'"
+    assert found["numpy"].status == "ok"
+    assert found["scipy"].status == "warning"
+    assert "tested with >=999" in found["scipy"].found
+    assert found["no-such-library"].status == "failed"
+    assert found["no-such-library"].advice == "pip install 'no-such-library>=1'"
     assert "mypy" not in found
 
 
 def test_a_root_that_is_a_file_or_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("x")
-    assert checks(tmp_path / "file")["warehouse"]["status"] == "failed"
+    assert checks(tmp_path / "file")["warehouse"].status == "failed"
 
     def refuse(**_: Any) -> None:
         raise OSError(30, os.strerror(30))
 
     monkeypatch.setattr(doctor.tempfile, "TemporaryFile", refuse)
     found = checks(tmp_path)["permissions"]
-    assert found["status"] == "failed"
-    assert f"{tmp_path} cannot be written: read-only file system" in found["found"]
+    assert found.status == "failed"
+    assert f"{tmp_path} cannot be written: read-only file system" in found.found
     assert run(["doctor", "--warehouse", str(tmp_path)]) == 1
 
 
@@ -71,7 +71,7 @@ def test_a_root_that_is_a_file_or_cannot_be_written(tmp_path: Path, monkeypatch:
 def test_free_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free: int, status: str) -> None:
     usage = shutil.disk_usage(tmp_path)._replace(free=free)
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _: usage)
-    assert checks(tmp_path)["disk"]["status"] == status
+    assert checks(tmp_path)["disk"].status == status
 
 
 def test_a_held_lock_and_an_open_cache_are_told(tmp_path: Path) -> None:
@@ -79,10 +79,10 @@ def test_a_held_lock_and_an_open_cache_are_told(tmp_path: Path) -> None:
     (tmp_path / "stages").chmod(0o755)
     lock = lock_path(tmp_path, "morpheus")
     with lock.open("w") as stream:
-        assert checks(tmp_path)["locks"]["found"] == "free"
+        assert checks(tmp_path)["locks"].found == "free"
         fcntl.flock(stream, fcntl.LOCK_EX)
-        assert "morpheus" in checks(tmp_path)["locks"]["found"]
-    assert checks(tmp_path)["cache"]["status"] == "warning"
+        assert "morpheus" in checks(tmp_path)["locks"].found
+    assert checks(tmp_path)["cache"].status == "warning"
 
 
 def test_a_server_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,15 +91,15 @@ def test_a_server_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.Monke
         address = f"http://127.0.0.1:{probe.getsockname()[1]}/api"
     monkeypatch.setenv("PREFECT_API_URL", address)
     found = checks(tmp_path)["server"]
-    assert found["status"] == "failed"
-    assert address in found["advice"]
+    assert found.status == "failed"
+    assert address in found.advice
 
 
 def test_a_server_that_answers(tmp_path: Path, prefect_server: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PREFECT_API_URL", prefect_server)
-    assert checks(tmp_path)["server"]["status"] == "ok"
+    assert checks(tmp_path)["server"].status == "ok"
 
 
 def test_an_archive_that_is_not_there(tmp_path: Path) -> None:
-    assert checks(tmp_path, tmp_path / "none")["archive"]["status"] == "failed"
-    assert checks(tmp_path, tmp_path)["archive"]["status"] == "ok"
+    assert checks(tmp_path, tmp_path / "none")["archive"].status == "failed"
+    assert checks(tmp_path, tmp_path)["archive"].status == "ok"

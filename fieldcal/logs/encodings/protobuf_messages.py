@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from fieldcal.logs.encodings.decoded import (
     Want,
     decode_each,
 )
+
+if TYPE_CHECKING:
+    from google.protobuf.message import Message
 
 
 class ProtobufDecoder:
@@ -100,9 +103,9 @@ class ProtobufDecoder:
         return True
 
 
-# Any, here and below: protobuf makes its classes at run time, so that no type knows their fields; `decode_each` makes
-# numbers of what they hold.
-def _value(message: Any, path: str) -> Any:
+# Any: protobuf makes its classes at run time, so that no type knows their fields; `decode_each` makes numbers of what
+# they hold.
+def _value(message: Message, path: str) -> Any:
     """The value at a dotted path. Raises ValueError where a message on the way is not set."""
     *parents, last = path.split(".")
     for name in parents:
@@ -112,7 +115,7 @@ def _value(message: Any, path: str) -> Any:
     return getattr(message, last)
 
 
-def _message_class(name: str, descriptors: bytes) -> tuple[Any, type[Exception]]:
+def _message_class(name: str, descriptors: bytes) -> tuple[type[Message], type[Exception]]:
     try:
         from google.protobuf import descriptor_pb2, descriptor_pool, message, message_factory
     except ImportError as error:
