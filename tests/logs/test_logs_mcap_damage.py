@@ -192,8 +192,8 @@ def test_a_frame_that_declares_100_gb_is_refused_at_once() -> None:
 def test_chunks_that_grow_too_much_are_left_out_beyond_a_total(
     whole: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fieldcal.logs.mcap.file.TOTAL_CAP_BYTES", 100_000)
-    monkeypatch.setattr("fieldcal.logs.mcap.file.TOTAL_CAP_RATIO", 1)
+    monkeypatch.setattr("fieldcal.logs.mcap.chunks.TOTAL_CAP_BYTES", 100_000)
+    monkeypatch.setattr("fieldcal.logs.mcap.chunks.TOTAL_CAP_RATIO", 1)
     tables, summary = read_or_none(tmp_path, whole)
     assert "unpacking over 100000 bytes" in summary.findings[0].sentence
     assert any(finding.loses_data for finding in summary.findings)

@@ -19,13 +19,21 @@ from fieldcal.logs.mcap.records import (
     Buffer,
     ChunkHead,
     Damage,
+    Fields,
     Record,
+    check_first_record,
     gather,
+    read_chunk_head,
     read_record,
 )
+from fieldcal.logs.mcap.report import Tally
 
 CHUNK_CAP_BYTES = 256 << 20
 """Largest uncompressed chunk that is read; writers use about 1 MiB."""
+
+TOTAL_CAP_BYTES = 512 << 20
+TOTAL_CAP_RATIO = 64
+"""A chunk may unpack to 64 times its own size (real logs: 2 to 15 times); all that go beyond, to 512 MiB together."""
 
 ZSTD_WINDOW_CAP_BYTES = 128 << 20
 OTHER_RECORDS_CAP = 100_000
@@ -40,6 +48,45 @@ class Located:
     starts: NDArray[np.int64]
     others: list[Record]
     damage: str | None
+
+
+class ChunkOpener:
+    """Opens the chunks of a file within what unpacking them may cost; that this was too much is said in the tally."""
+
+    def __init__(self, buffer: Buffer, tally: Tally) -> None:
+        self._buffer = buffer
+        self._tally = tally
+        self._budget = TOTAL_CAP_BYTES
+
+    def open(self, start: int, limit: int, *, searching: bool = False) -> tuple[ChunkHead, bytes | memoryview] | str:
+        """Head and content of the chunk at `start`, or why it cannot be read.
+
+        Chunks read one behind the other cannot unpack to more than their ratio allows. Where chunks are searched for,
+        false ones may overlap: each that fails draws on what all together may cost.
+        """
+        try:
+            head = read_chunk_head(Fields(self._buffer, start + HEAD_BYTES, limit))
+            size = head.uncompressed_size
+            if size > CHUNK_CAP_BYTES:
+                raise Damage(f"the chunk declares {size} bytes, the cap is {CHUNK_CAP_BYTES}")
+            if searching and not head.compression:
+                check_first_record(self._buffer, head)
+            if searching or size > TOTAL_CAP_RATIO * (head.end - head.start):
+                if size > self._budget:
+                    return self._refused(searching)
+                self._budget -= size
+            content = decompress(self._buffer, head)
+            if searching:
+                self._budget += size
+            return head, content
+        except Damage as damage:
+            return str(damage)
+
+    def _refused(self, searching: bool) -> str:
+        if not searching:
+            return f"unpacking over {TOTAL_CAP_BYTES} bytes from chunks that grow over {TOTAL_CAP_RATIO} times refused"
+        self._tally.stopped = f"searching over {TOTAL_CAP_BYTES} bytes behind damage for a chunk is refused"
+        return self._tally.stopped
 
 
 def decompress(buffer: Buffer, head: ChunkHead) -> bytes | memoryview:

@@ -8,7 +8,6 @@ What was lost is told in findings.
 from __future__ import annotations
 
 import mmap
-import re
 import zlib
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldcal.errors import UnreadableLog
-from fieldcal.logs.mcap.chunks import CHUNK_CAP_BYTES, decompress, locate_messages
+from fieldcal.logs.mcap.chunks import ChunkOpener, locate_messages
 from fieldcal.logs.mcap.mapped import map_file
 from fieldcal.logs.mcap.records import (
     CHANNEL,
@@ -35,36 +34,27 @@ from fieldcal.logs.mcap.records import (
     MESSAGE_INDEX,
     METADATA,
     SCHEMA,
-    ChunkHead,
     Damage,
     Fields,
     Record,
     Statistics,
-    check_first_record,
     check_record,
     gather,
     read_channel,
-    read_chunk_head,
     read_message_index,
     read_metadata,
     read_record,
     read_schema,
 )
 from fieldcal.logs.mcap.report import Definitions, Tally
+from fieldcal.logs.mcap.search import Search
 from fieldcal.logs.mcap.summary import ends_whole, read_summary
 from fieldcal.reason_codes import ReasonCode
-
-TOTAL_CAP_BYTES = 512 << 20
-TOTAL_CAP_RATIO = 64
-"""A chunk may unpack to 64 times its own size (real logs: 2 to 15 times); all that go beyond, to 512 MiB together."""
 
 MESSAGES_AT_ONCE = 1 << 16
 LOOSE_BYTES = 4 << 20
 RELEASE_BYTES = 64 << 20
 _CRC_PIECE_BYTES = 16 << 20
-_LOOSE_CHAIN = 4
-_CHUNK_PATTERN = re.compile(rb"\x06.{5}\x00{3}.{21}\x00{3}.{4}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd)", re.DOTALL)
-_LOOSE_PATTERN = re.compile(rb"[\x03-\x0f].{3}\x00{5}", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -101,8 +91,7 @@ class McapFile:
         self.metadata: dict[str, dict[str, str]] = {}
         self.statistics: Statistics | None = None
         self.tally = Tally()
-        self._budget = TOTAL_CAP_BYTES
-        self._searched: tuple[int, int | None] | None = None
+        self._opener = ChunkOpener(self.buffer, self.tally)
         self._seen: dict[tuple[int, int, int, int], tuple[int, int]] = {}
         self._lost_chunk = False
         self._unsure = -1
@@ -114,8 +103,9 @@ class McapFile:
         if self._has_end:
             self._limit = self.size - len(MAGIC) - FOOTER_BYTES
             self._adopt_summary()
+        self._search = Search(self.buffer, self._limit, self._opener, self.tally, self.definitions, self.statistics)
         if self.buffer[: len(MAGIC)] != MAGIC:
-            self._begin = self._next_chunk(0)
+            self._begin = self._search.next_chunk(0)
             if self._begin is None:
                 raise UnreadableLog(
                     ReasonCode.NOT_MCAP,
@@ -145,7 +135,7 @@ class McapFile:
             record = self._sound_record(position)
             if record is None:
                 declared_end = self._declared_end(position)
-                position = self._resynchronised(self._unsure if self._unsure >= 0 else position, declared_end)
+                position = self._search.resynchronised(self._unsure if self._unsure >= 0 else position, declared_end)
                 if position is None and declared_end is None and not self._has_end:
                     self.tally.forget_cut()
             elif record.opcode == CHUNK:
@@ -174,7 +164,7 @@ class McapFile:
         except Damage as damage:
             if self.buffer[position] != CHUNK:
                 self.tally.damaged_records.append((position, str(damage)))
-            elif (end := self._chunk_by_inner_length(position)) is not None:
+            elif (end := self._search.chunk_end(position)) is not None:
                 self.tally.damaged_records.append((position, f"a chunk's record length is wrong: {damage}"))
                 return Record(CHUNK, position, position + HEAD_BYTES, end)
             else:
@@ -182,11 +172,6 @@ class McapFile:
             self._lost_chunk = True
             return None
         return record
-
-    def _chunk_by_inner_length(self, position: int) -> int | None:
-        """End of a chunk whose record length is wrong, when its inner length leads to content that fits its CRC."""
-        opened = self._open_chunk(position, self._limit, searching=True)
-        return None if isinstance(opened, str) or not opened[0].crc else opened[0].end
 
     def _declared_end(self, position: int) -> int | None:
         try:
@@ -229,16 +214,16 @@ class McapFile:
 
     def _chunk(self, record: Record) -> Generator[Block, None, int | None]:
         self._lost_chunk, self._unsure = False, -1
-        opened = self._open_chunk(record.start, record.end)
+        opened = self._opener.open(record.start, record.end)
         if isinstance(opened, str):
             self.tally.damaged_chunks.append((record.start, opened))
             self._lost_chunk = True
-            return self._resynchronised(record.start, record.end)
+            return self._search.resynchronised(record.start, record.end)
         head, content = opened
         end = record.end
         if head.end != end:
             self.tally.damaged_records.append((record.start, "a chunk ends before its record does"))
-            end = head.end if self._plausible(head.end) else end
+            end = head.end if self._search.plausible(head.end) else end
         hints, after = self._indexes(end)
         key = (head.message_start_time, head.message_end_time, head.uncompressed_size, head.crc)
         if key in self._seen:
@@ -256,38 +241,6 @@ class McapFile:
             self.tally.damaged_chunks.append((record.start, located.damage))
         yield from self._slices(data, located.starts, head.crc != 0)
         return after
-
-    def _open_chunk(
-        self, start: int, limit: int, *, searching: bool = False
-    ) -> tuple[ChunkHead, bytes | memoryview] | str:
-        """Head and content of the chunk at `start`, or why it cannot be read.
-
-        Chunks read one behind the other cannot unpack to more than their ratio allows. Where chunks are searched for,
-        false ones may overlap: each that fails draws on what all together may cost.
-        """
-        try:
-            head = read_chunk_head(Fields(self.buffer, start + HEAD_BYTES, limit))
-            size = head.uncompressed_size
-            if size > CHUNK_CAP_BYTES:
-                raise Damage(f"the chunk declares {size} bytes, the cap is {CHUNK_CAP_BYTES}")
-            if searching and not head.compression:
-                check_first_record(self.buffer, head)
-            if searching or size > TOTAL_CAP_RATIO * (head.end - head.start):
-                if size > self._budget:
-                    return self._refused(searching)
-                self._budget -= size
-            content = decompress(self.buffer, head)
-            if searching:
-                self._budget += size
-            return head, content
-        except Damage as damage:
-            return str(damage)
-
-    def _refused(self, searching: bool) -> str:
-        if not searching:
-            return f"unpacking over {TOTAL_CAP_BYTES} bytes from chunks that grow over {TOTAL_CAP_RATIO} times refused"
-        self.tally.stopped = f"searching over {TOTAL_CAP_BYTES} bytes behind damage for a chunk is refused"
-        return self.tally.stopped
 
     def _indexes(self, position: int) -> tuple[list[NDArray[np.uint64]], int]:
         """The message indexes that follow a chunk, and the position behind them."""
@@ -343,66 +296,3 @@ class McapFile:
                 known = channel_id in self.definitions.channels
                 (self.tally.messages if known else self.tally.unknown_channels)[channel_id] += count
             yield Block(data, some, verified)
-
-    def _resynchronised(self, damaged: int, declared_end: int | None = None) -> int | None:
-        """Where reading can go on behind damage at byte `damaged`, or None."""
-        if declared_end is not None and self._plausible(declared_end):
-            return declared_end
-        places = [
-            place for place in (self._next_chunk(damaged + 1), self._next_loose(damaged + 1)) if place is not None
-        ]
-        return min(places, default=None)
-
-    def _plausible(self, position: int) -> bool:
-        if position >= self._limit:
-            return position == self._limit
-        try:
-            check_record(self.buffer, read_record(self.buffer, position, self._limit))
-        except Damage:
-            return False
-        return True
-
-    def _next_chunk(self, position: int) -> int | None:
-        """The next chunk whose content matches its CRC."""
-        if self._searched is not None:
-            start, found = self._searched
-            if start <= position and (found is None or position <= found):
-                return found
-        found = self._search_chunk(position)
-        self._searched = position, found
-        return found
-
-    def _search_chunk(self, position: int) -> int | None:
-        for match in _CHUNK_PATTERN.finditer(self.buffer, position, self._limit):
-            if self._chunk_by_inner_length(match.start()) is not None:
-                return match.start()
-            if self.tally.stopped:
-                return None
-        return None
-
-    def _next_loose(self, position: int) -> int | None:
-        """The next of several sound records in a row, in a file that keeps its messages outside chunks."""
-        if (
-            self.tally.chunks
-            or self.tally.damaged_chunks
-            or (self.statistics is not None and self.statistics.chunk_count)
-        ):
-            return None
-        for match in _LOOSE_PATTERN.finditer(self.buffer, position, self._limit):
-            place: int | None = match.start()
-            for _ in range(_LOOSE_CHAIN):
-                place = self._sound_end(place) if place is not None and place < self._limit else place
-            if place is not None:
-                return match.start()
-        return None
-
-    def _sound_end(self, position: int) -> int | None:
-        try:
-            record = read_record(self.buffer, position, self._limit)
-            check_record(self.buffer, record)
-        except Damage:
-            return None
-        if record.opcode == MESSAGE:
-            channel_id = int.from_bytes(self.buffer[record.body : record.body + 2], "little")
-            return record.end if channel_id in self.definitions.channels else None
-        return record.end
