@@ -21,7 +21,7 @@ from fieldcal.stages.tables import QUATERNION, columns_of, constants, matrix, tr
 if TYPE_CHECKING:
     from fieldcal.config.stage_settings import AttitudeSettings, Axes, BodyVectors, LoggedValues, VectorConstants
 
-# Trust in an attitude halves where the sensed length is off by this share of the field.
+# The weight of an attitude halves where a measured length is off by this share of gravity, or of the local field.
 TRUST_ACCELERATION, TRUST_FIELD = 0.01, 0.01
 
 
@@ -35,7 +35,7 @@ TRUSTED_SHARE = 0.2
 
 
 def logged_constants(s: LoggedValues, name: Sensor) -> tuple[Array, Array] | None:
-    """Scale from the logged unit alone, bias 0: what an SI log says of itself. None for counts."""
+    """Scale from the logged unit alone, with the configured polarity, and bias 0; None for counts."""
     nominal = s.nominal_scale[name]
     if nominal is None:
         return None
@@ -43,10 +43,10 @@ def logged_constants(s: LoggedValues, name: Sensor) -> tuple[Array, Array] | Non
 
 
 def vector_constants(tables: Tables, s: VectorConstants, name: Sensor) -> tuple[tuple[Array, Array] | None, bool]:
-    """Constants to make a vector of a triad's readings, and whether they are its own fit's.
+    """Constants that calibrate a vector triad, and whether they are its fit's.
 
-    Else what the logged unit says; a magnetometer in a physical unit where the local field is only "norm" is scaled
-    to the median length, since attitude needs directions only. None: refused raw counts."""
+    Without a fit they are the logged unit's; a magnetometer in a physical unit where the local field is only "norm" is
+    scaled to the median length, since attitude needs directions only. None: counts without a fit."""
     fitted_constants = constants(tables[name], name) if name in tables else None
     if fitted_constants is not None:
         return fitted_constants, True
@@ -76,9 +76,10 @@ def body_vectors(
 
 
 def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
-    """samples and both triads' constants → attitude (Eq. 9), weighted by what the sensed lengths say.
+    """samples and both triads' constants → attitude (Eq. 9), weighted by the errors of the measured lengths.
 
-    Where an SI log's ellipsoid is refused its logged values are used, flagged; raw counts stop here."""
+    Where the ellipsoid fit of a log in SI units was refused the logged values are used, with a reason code; counts
+    without a fit end in a refusal."""
     used: dict[Sensor, tuple[Array, Array]] = {}
     fallback = []
     for name in VECTOR_SENSORS:
@@ -93,7 +94,7 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
             return StageResult(
                 status=Status.REFUSED,
                 reason_code=ReasonCode(f"{name}_refused"),
-                reason=f"Attitude needs a calibrated {name}; its fit was refused and raw counts are no vector.",
+                reason=f"Attitude needs a calibrated {name}; its fit was refused, and counts give no direction.",
             )
         used[name] = triad_constants
     vectors = body_vectors(tables["samples"], used, s, prefix="smoothed_")
@@ -132,7 +133,7 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
             ReasonCode.GRAVITY_SIGN_CONTRADICTION,
             dip_deg,
             expected_dip,
-            f"The sensed field dips by {dip_deg:.0f}° where {expected_dip:.0f}° is configured:"
+            f"The measured field dips by {dip_deg:.0f}° where {expected_dip:.0f}° is configured:"
             f' gravity_sign "{s.gravity_sign}" (or the polarity of a whole triad) is the wrong way round.',
             measured,
         )
@@ -156,18 +157,18 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
 def _contradiction(
     code: ReasonCode, number: float, limit: float, reason: str, measured: dict[str, Json]
 ) -> StageResult:
-    """A refusal that puts both vector triads in question: which of them is wrong cannot be decided."""
+    """A refusal with a fatal fault of both vector triads: which of them is wrong cannot be told."""
     rows = [Fault(name, "", code, number, limit, True, reason) for name in VECTOR_SENSORS]
     return StageResult({"faults": fault_rows(rows)}, Status.REFUSED, code, reason, measured)
 
 
 def _dip_deg(vectors: Array) -> Array:
-    """Angle of the sensed field below the sensed horizontal, degrees, (n,)."""
+    """Dip: angle of the measured field below the plane normal to measured gravity, degrees, (n,)."""
     unit = vectors / np.linalg.norm(vectors, axis=2, keepdims=True)
     return np.asarray(np.degrees(np.arcsin(np.clip(np.einsum("ni,ni->n", unit[:, 0], unit[:, 1]), -1.0, 1.0))))
 
 
 def sensor_attitude(q: Array, s: Axes) -> Array:
-    """Attitude of the sensor axes (n, 4) from that of the body: gyroscope constants live in sensor axes."""
+    """Attitude of the sensor axes (n, 4) from that of the body: gyroscope constants are in sensor axes."""
     axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
     return multiply(q, from_matrix(axes.T))

@@ -1,4 +1,4 @@
-"""Everything estimated against everything the paper compares it with: TICs and physical units."""
+"""Agreement of estimates with their references: the paper's Theil inequality coefficients, and rms errors."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ FIT_SCHEMA = {
 
 
 def verify_fit(tables: Tables, s: VerifySettings) -> StageResult:
-    """Everything estimated → fit: the paper's five TICs and one more, raw and smoothed, with physical units."""
+    """All estimates → fit: the paper's five TICs and one more, raw and smoothed, and rms errors in physical units."""
     samples, attitude = tables["samples"], tables.get("attitude")
     t = seconds(samples["t_ns"], int(samples["t_ns"][0]))
     segment = samples["segment"].to_numpy()
@@ -221,7 +221,7 @@ def _propagated_against_vps(
     vps_t: Array,
     s: Axes,
 ) -> None:
-    """Open-loop drift: the gyroscope integrated over each segment from its best start, against the VPS."""
+    """Attitude integrated from the gyroscope over each segment, its initial attitude fitted, against the VPS."""
     to_sensor = sensor_attitude(matrix(vps, QUATERNION), s)
     near = bridged(t, vps_t)
     index = np.clip(np.searchsorted(t, vps_t), 0, len(t) - 1)
@@ -233,7 +233,7 @@ def _propagated_against_vps(
 
 
 def _smoothed_blocks(t: Array, x: Array, s: SmoothingSettings) -> Array:
-    """Low-pass by contiguous block of the VPS's own grid."""
+    """Low-pass of each contiguous stretch of the VPS's uniform grid."""
     out = np.empty_like(x)
     for a, b in contiguous(t, BRIDGE_S):
         out[a:b] = smoothing.smooth_samples(

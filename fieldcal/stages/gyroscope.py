@@ -63,13 +63,13 @@ GYRO_REASONS = "Gyroscope axes refused ({axes}): too little rotation about them,
 def calibrate_gyro_equation(tables: Tables, s: GyroEquationSettings) -> StageResult:
     """samples, attitude → calibration of the gyroscope by equation error (Eq. 10–15).
 
-    Noise that smoothing leaves in the readings is taken off the regressor."""
+    The variance of the noise that smoothing leaves in the regressor is subtracted from the normal equations."""
     return _equation_error(tables, s, None)
 
 
 def calibrate_gyro_equation_pass2(tables: Tables, s: GyroEquationPass2Settings) -> StageResult:
-    """The same from the second attitude; where the vector triads' covariances are given, what they do to the result is
-    in its sd."""
+    """The same from the second pass's attitude; the vector triads' covariances, where given, are propagated into the
+    sd."""
     return _equation_error(tables, s, s)
 
 
@@ -164,7 +164,7 @@ def calibrate_gyro_output(tables: Tables, s: GyroOutputSettings) -> StageResult:
     """samples, attitude, equation-error start → calibration by output error, with the triads' uncertainty
     propagated.
 
-    It also has the last word on equation error's rows, which it hands on: one that it contradicts is refused."""
+    Equation error's rows are handed on; those that output error contradicts are refused."""
     equation = tables["gyroscope"]
     result = _output_error(tables, s)
     if "calibration" not in result.tables:
@@ -271,7 +271,7 @@ def _start(
 
 
 def _suitable_stretch(start: GyroFit, t: Array, logged: Array, tables: Tables) -> float:
-    """Stretch length from the gyroscope's sample-to-sample noise and the attitude's error."""
+    """Length of the integrated stretches, s, from the gyroscope's white noise and the attitude's error."""
     noise = white_noise_sigma(logged)
     excess = tables["attitude"]["acceleration_excess_mps2"].to_numpy(), tables["attitude"]["field_excess"].to_numpy()
     error = max(spread_of(excess[0] / 9.81), spread_of(excess[1]))
@@ -281,8 +281,8 @@ def _suitable_stretch(start: GyroFit, t: Array, logged: Array, tables: Tables) -
 
 
 def _triad_uncertainty(tables: Tables, s: TriadUncertainty) -> list[tuple[Array, Array]]:
-    """[(directions sensed (n, 3) …)] see `propagation`: one (Jacobian of the attitude, covariance) pair per vector
-    triad."""
+    """Of each vector triad with a covariance: the Jacobian of the attitude error, sensor axes, to its constants
+    (n, 3, 6), and their covariance (6, 6). See `estimation.uncertainty_propagation`."""
     if not any(f"{name}_covariance" in tables for name in VECTOR_SENSORS):
         return []
     samples, attitude = tables["samples"], tables["attitude"]

@@ -31,7 +31,7 @@ def mean_temperature(tables: Tables) -> float | None:
 
 
 def is_sound(tables: Tables, sensor: str) -> bool:
-    """Whether neither the sanity check nor the motors' current found a fatal fault of a sensor."""
+    """Whether neither `sanity` nor the comparison with the motors' current found a fatal fault of a sensor."""
     found = [tables[name] for name in ("faults", "motor_faults") if name in tables]
     return all(fatal_fault(faults, (sensor,)) is None for faults in found)
 
@@ -60,12 +60,12 @@ def differentiate_by_segment(samples: pl.DataFrame, x: Array, window_s: float) -
 
 
 def spread_of(excess: Array) -> float:
-    """Robust spread of a relative excess length: the direction noise to expect across it. At least 1e-4 rad."""
+    """Robust sd of the relative error of a vector's length, taken for the sd of its direction, rad; at least 1e-4."""
     return max(robust_sigma(excess - np.median(excess)), 1e-4)
 
 
 def refusal(error: Exception, name: str, measured: Mapping[str, Json] | None = None) -> StageResult:
-    """A refusal without a result, from whatever the numerics raised."""
+    """A refusal without tables, from an error of the estimation."""
     code = error.reason_code if isinstance(error, FieldcalError) else ReasonCode.UNUSABLE_READINGS
     return StageResult(
         status=Status.REFUSED,

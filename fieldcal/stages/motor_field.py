@@ -1,4 +1,4 @@
-"""Does the calibrated magnetometer go with the motors' current, where a log has one?"""
+"""Correlation of the calibrated magnetometer with the motors' current, where a log has one."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ MOST_SAMPLES = 50_000
 """A longer flight's magnetometer is thinned to fewer: the current is slow."""
 
 DRIVES = {"current_a": ("current", "A"), "throttle": ("throttle", "")}
-"""What drives the motors, the better one first: column → word and unit."""
+"""Measures of the motors' current, the better one first: column → word and unit."""
 
 
 def check_motor_field(tables: Tables, s: VectorsSettings) -> tuple[dict[str, Json], list[Fault]]:
     """power, readings and constants of the magnetometer → measured numbers and faults; both empty without a current
-    and where the readings are insane already."""
+    and where `sanity` found the magnetometer faulty."""
     if not {"power", "readings", "segments"} <= tables.keys():
         return {}, []
     if "sanity" in tables and fatal_fault(tables["sanity"], ("magnetometer",)) is not None:
@@ -70,7 +70,7 @@ def check_motor_field(tables: Tables, s: VectorsSettings) -> tuple[dict[str, Jso
 
 def _approximate(tables: Tables, s: VectorsSettings, values: Array) -> tuple[Array, Array] | None:
     """Scale and bias to start from: the magnetometer's, of a refused fit too (the current may be why it was refused),
-    else the algebraic fit's; what a constant ellipsoid lacks is fitted beside the current's field."""
+    else the algebraic fit's; what is wrong with them is fitted together with the current's field."""
     fitted = (
         constants(tables["magnetometer"], Sensor.MAGNETOMETER, refused_too=True) if "magnetometer" in tables else None
     )
@@ -85,7 +85,7 @@ def _approximate(tables: Tables, s: VectorsSettings, values: Array) -> tuple[Arr
 
 
 def _drive_at(t_ns: np.ndarray, own_ns: np.ndarray, values: Array) -> Array:
-    """Drive at the stamps, (n,), linear between its readings; NaN before, behind and in its pauses."""
+    """Current or throttle at the stamps, (n,), linear between its readings; NaN outside them and in their gaps."""
     at, stamps_s = (t_ns - own_ns[0]) * 1e-9, (own_ns - own_ns[0]) * 1e-9
     result = np.interp(at, stamps_s, values, left=np.nan, right=np.nan)
     longest = max(PAUSE_S, PAUSE * float(np.median(np.diff(stamps_s))))
@@ -95,7 +95,7 @@ def _drive_at(t_ns: np.ndarray, own_ns: np.ndarray, values: Array) -> Array:
 
 
 def _outside(throttle: Array) -> Fault | None:
-    """A throttle that is not in 0 to 1 is in an unknown unit."""
+    """The fault of a throttle that leaves 0 to 1, whose unit is unknown; else None."""
     low, high = float(throttle.min()), float(throttle.max())
     if low >= 0.0 and high <= 1.0:
         return None

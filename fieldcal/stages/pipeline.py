@@ -1,4 +1,4 @@
-"""The whole data path, as one tuple: who reads what, who writes what, and which settings matter.
+"""The pipeline: the stages in order, the tables that each reads and writes, and the settings that it takes.
 
 Tables are named `stage.table`; the log's own are `ingest.imu`, `ingest.magnetometer`, … . `run_flight` walks it in
 memory; the night walks the same tuple through its cache.
@@ -121,7 +121,7 @@ PIPELINE: tuple[Stage, ...] = (
         ("calibration", "covariance"),
         (Sensor.GYROSCOPE,),
     ),
-    # Second pass, now with rates: lever arm (Eq. 3) and sample gate.
+    # Second pass, with rates: the lever arm is corrected (Eq. 3), samples are gated.
     _stage(
         "accelerometer_pass2",
         vector_triads.calibrate_accelerometer_gated,
@@ -262,7 +262,7 @@ PIPELINE: tuple[Stage, ...] = (
     ),
 )
 
-# Which stage's table is the flight's word, for each published table.
+# The stages' tables that each published table is made of.
 PUBLISHED: dict[str, tuple[str, ...]] = {
     "calibration": (
         "vectors.calibration",

@@ -1,4 +1,4 @@
-"""The first two stages: which stretches of the log to use, and their readings at one set of stamps, smoothed."""
+"""Selection of the segments to calibrate on, and their readings at the IMU's stamps, smoothed."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from fieldcal.config.stage_settings import ManoeuvreSettings, SmoothingSettings
 
 SHORTEST_STRETCH = 10
-MAGNETOMETER_PAUSE_S = 0.1
-MAGNETOMETER_PAUSE = 5.0
-"""A magnetometer is interpolated over so many of its intervals, and over MAGNETOMETER_PAUSE_S, at the most."""
+MAGNETOMETER_GAP_S = 0.1
+MAGNETOMETER_GAP_INTERVALS = 5.0
+"""Longest gap that a magnetometer is interpolated over: so many of its intervals, or MAGNETOMETER_GAP_S if longer."""
 
 
 class _Stretch(NamedTuple):
-    """Samples without a pause: stamps and number of the segment (n,), readings logged and smoothed (n, 9)."""
+    """Samples without a gap: stamps and number of the segment (n,), readings logged and smoothed (n, 9)."""
 
     t_ns: NDArray[np.int64]
     segment: NDArray[np.int32]
@@ -110,7 +110,9 @@ def smooth(tables: Tables, s: SmoothingSettings) -> StageResult:
         parts.append(_Stretch(stamps[rows], np.full(len(x), number, dtype=np.int32), x, smoothed))
     if not parts:
         return StageResult(
-            status=Status.REFUSED, reason_code=ReasonCode.NO_MANOEUVRE, reason="The magnetometer pauses throughout."
+            status=Status.REFUSED,
+            reason_code=ReasonCode.NO_MANOEUVRE,
+            reason="The magnetometer has gaps throughout.",
         )
     t_ns, segment, x, smoothed = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
     names = triad("gyroscope") + triad("accelerometer") + triad("magnetometer")
@@ -126,7 +128,7 @@ def smooth(tables: Tables, s: SmoothingSettings) -> StageResult:
 
 
 def _whole_stretches(segments: pl.DataFrame, stamps: np.ndarray, logged: Array) -> list[tuple[int, slice]]:
-    """Number and rows of each used segment; one in which the magnetometer pauses falls into the stretches between."""
+    """Number and rows of each used segment; one with gaps in the magnetometer is split at them."""
     found: list[tuple[int, slice]] = []
     silent = np.asarray(np.isnan(logged[:, 6:]).any(axis=1))
     extra = int(segments["segment"].max()) + 1  # type: ignore[arg-type]
@@ -144,8 +146,8 @@ def _whole_stretches(segments: pl.DataFrame, stamps: np.ndarray, logged: Array) 
 
 
 def _magnetometer_at(tables: Tables, stamps: np.ndarray) -> Array:
-    """Magnetometer at the IMU's stamps, (n, 3), linear between its readings, held past its ends for the length of a
-    pause; NaN in longer pauses and where there is none."""
+    """Magnetometer at the IMU's stamps, (n, 3), linear between its readings, held past its ends for as long as
+    the longest gap that is interpolated over; NaN in longer gaps and where there is none."""
     magnetometer = tables.get("magnetometer")
     if magnetometer is None or len(magnetometer) < 2:
         return np.full((len(stamps), 3), np.nan)
@@ -156,10 +158,10 @@ def _magnetometer_at(tables: Tables, stamps: np.ndarray) -> Array:
     origin = stamps[0]
     at, stamps_s = (stamps - origin) * 1e-9, (stamps_ns - origin) * 1e-9
     result = np.column_stack([np.interp(at, stamps_s, column) for column in values.T])
-    longest = max(MAGNETOMETER_PAUSE_S, MAGNETOMETER_PAUSE * float(np.median(np.diff(stamps_s))))
+    longest = max(MAGNETOMETER_GAP_S, MAGNETOMETER_GAP_INTERVALS * float(np.median(np.diff(stamps_s))))
     i = interval_of(stamps_s, at, on_stamp="ends")
     between = (stamps_s[0] <= at) & (at <= stamps_s[-1])
-    paused = between & (stamps_s[i + 1] - stamps_s[i] > longest)
+    in_gap = between & (stamps_s[i + 1] - stamps_s[i] > longest)
     beyond = np.maximum(stamps_s[0] - at, at - stamps_s[-1]) > longest
-    result[(paused & ~np.isin(stamps, stamps_ns)) | beyond] = np.nan
+    result[(in_gap & ~np.isin(stamps, stamps_ns)) | beyond] = np.nan
     return result

@@ -1,4 +1,4 @@
-"""Results as table rows: what a fitted triad says in the `calibration` table, and what a stage hands back."""
+"""Results as table rows: those of a fitted triad in `calibration`, faults, and the result of a stage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Are the sensors sane: the readings of every triad against the numbers of `faults`."""
+"""Plausibility of every triad's readings, by the limits of `estimation.faults`."""
 
 from __future__ import annotations
 

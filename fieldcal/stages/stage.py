@@ -23,7 +23,7 @@ class Stage:
     `needs` are those it cannot do without, `trusts` the sensors that must be free of fatal faults."""
 
     name: str
-    function: Callable[[Tables, Any], StageResult]
+    function: Callable[[Tables, Any], StageResult]  # Any: settings of class `takes`, as `pipeline` checks
     takes: type[StageSettings]
     reads: Mapping[str, str]
     needs: tuple[str, ...]
@@ -48,7 +48,7 @@ def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: Flight
 
 def refused_beforehand(stage: Stage, inputs: Mapping[str, pl.DataFrame]) -> StageResult | None:
     """The refusal of a stage that is not to run on these inputs: a sensor is faulty, or something needed is missing."""
-    # An attitude is as good as the vectors that it came from.
+    # A fault of the vectors is one of the attitude that was made of them.
     for faults, sensors in (("faults", stage.trusts), ("attitude_faults", VECTOR_SENSORS)):
         fault = fatal_fault(inputs[faults], sensors) if faults in inputs else None
         if fault is not None:

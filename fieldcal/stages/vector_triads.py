@@ -63,8 +63,8 @@ def calibrate_magnetometer(tables: Tables, s: MagnetometerSettings) -> StageResu
 
 
 def calibrate_accelerometer(tables: Tables, s: AccelerometerSettings) -> StageResult:
-    """samples → calibration: first pass, every sample. Provisional: it only has to start the second pass, so its
-    limits are wide and, where the refinement finds no minimum, the algebraic fit stands in."""
+    """samples → calibration: first pass, every sample. Provisional: it only starts the second pass, so its limits are
+    wide and, where the refinement does not converge, the algebraic fit is taken."""
     wide = replace(s, ellipsoid_max_scale_sd=PROVISIONAL, ellipsoid_max_residual=PROVISIONAL)
     logged = _used_readings(tables, Sensor.ACCELEROMETER)
     result = _ellipsoid_stage(Sensor.ACCELEROMETER, tables, wide, s.gravity_mps2, "m/s^2", logged)
@@ -148,16 +148,15 @@ def _judged(
 
 
 def calibrate_accelerometer_gated(tables: Tables, s: GatedAccelerometerSettings) -> StageResult:
-    """samples, first-pass constants and rates → calibration: second pass, lever arm taken out (Eq. 3), quiet samples
-    only.
+    """samples, first-pass constants and rates → calibration: second pass, corrected for the lever arm (Eq. 3), gated.
 
-    Where the low-passed norm strays from g by more than 1 % rms something else than gravity was sensed: the gate
-    (norm near g, slow rotation) then applies if enough of the sphere remains behind it."""
+    Where the smoothed norm differs from g by more than 1 % rms, other accelerations than gravity were measured: samples
+    are then gated (norm near g, slow rotation), if those that pass make the scales more certain."""
     samples = tables["samples"]
     fitted = constants(tables["accelerometer"], Sensor.ACCELEROMETER) if "accelerometer" in tables else None
     calibration = fitted or logged_constants(s, Sensor.ACCELEROMETER)
     if calibration is None or samples["gyroscope_x"].null_count() or samples["accelerometer_x"].null_count():
-        # Nothing to gate with: the first pass again, under the limits that count.
+        # Without rates there is no gate: the first pass again, under the final limits.
         used = _used_readings(tables, Sensor.ACCELEROMETER)
         return _ellipsoid_stage(Sensor.ACCELEROMETER, tables, s, s.gravity_mps2, "m/s^2", used)
     gyro = logged_constants(s, Sensor.GYROSCOPE)
@@ -166,7 +165,7 @@ def calibrate_accelerometer_gated(tables: Tables, s: GatedAccelerometerSettings)
     logged, smoothed = matrix(samples, triad("accelerometer")), matrix(samples, triad("accelerometer", "smoothed_"))
     measured: dict[str, Json] = {"lever_arm_applied": s.lever_arm_m is not None and gyro is not None}
     if gyro is None:
-        # Rates in counts: at rest, the one thing that can be seen without a scale.
+        # Rates in counts: without a scale only rest can be told, against the noise.
         level, noise = motion_selection.windowed_rate(
             seconds(samples["t_ns"], samples["t_ns"][0]), matrix(samples, triad("gyroscope")), REST_WINDOW_S
         )
@@ -205,7 +204,7 @@ def _scale_doubt(fit: TriadFit) -> float:
 
 
 def _gated_fit(source: Array, quiet: np.ndarray, s: GatedAccelerometerSettings) -> TriadFit | None:
-    """Fit of the quiet samples; None where they see too little of the sphere."""
+    """Fit of the samples that passed the gate; None where they are few or their directions too alike."""
     if quiet.sum() < 100:
         return None
     try:
@@ -226,7 +225,7 @@ def _lever_arm(samples: pl.DataFrame, rate: Array, arm_m: Triple, window_s: floa
 
 def _with_motor_field(rows: pl.DataFrame, share: float, strength: float) -> pl.DataFrame:
     """Magnetometer rows whose sd allows for a field of `share` times the local one that follows the motors' current: a
-    constant ellipsoid may take all of it for scale or for bias, and its residual need not show it."""
+    fit with constant parameters may absorb all of it in scale or bias without a larger residual."""
     of_axis = rows.filter(pl.col("parameter") == "scale").select("method", "axis", scale=pl.col("value").abs())
     could_err = (
         pl.when(pl.col("parameter") == "scale")
@@ -240,10 +239,10 @@ def _with_motor_field(rows: pl.DataFrame, share: float, strength: float) -> pl.D
 
 
 def judge_vectors(tables: Tables, s: VectorsSettings) -> StageResult:
-    """Both vector triads' calibrations and what the attitude and the motors' current say of them → calibration, faults.
+    """Both vector triads' calibrations, the attitude's faults and the motors' current → calibration, faults.
 
-    A fit by length alone cannot see polarity or axes, so where attitude says that they contradict each other neither
-    is good."""
+    A fit by length alone does not determine polarity or axes: where the attitude found that the triads contradict each
+    other, both are refused."""
     measured, motor_faults = check_motor_field(tables, s)
     motor = next((fault for fault in motor_faults if fault.code == ReasonCode.MOTOR_FIELD), None)
     faults = fault_rows(motor_faults)

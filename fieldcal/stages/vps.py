@@ -61,7 +61,7 @@ def synchronise_vps(tables: Tables, s: VpsSyncSettings) -> StageResult:
     rate = (logged - np.median(logged, axis=0) if gyro is None else sensor_model.calibrate(logged, *gyro)) @ axes.T
     origin = int(imu["t_ns"][0])
     t_imu = seconds(imu["t_ns"], origin)
-    # Clocks of different epochs: their starts are laid together first, as integers.
+    # Clocks of different epochs: their starts are aligned first, as integers.
     base_ns = int(vps["t_ns"][0]) - origin
     if abs(base_ns) * 1e-9 <= s.vps_max_lag_s + t_imu[-1]:
         base_ns = 0
@@ -116,7 +116,7 @@ def synchronise_vps(tables: Tables, s: VpsSyncSettings) -> StageResult:
 def _refined(
     fit: by_rates.SyncFit, tables: Tables, s: VpsClock, origin: int, t_vps: Array, q_vps: Array
 ) -> tuple[by_rates.SyncFit, dict[str, Json]]:
-    """The clock by a sound magnetometer too, and what that found."""
+    """The clock refined by the magnetometer where that has no fault, and the numbers of it."""
     table = tables.get("magnetometer_log")
     if table is None or table.is_empty() or not is_sound(tables, "magnetometer"):
         return fit, {"synchronised_by": "gyroscope"}
@@ -140,7 +140,7 @@ def _sync_row(values: dict[str, Json]) -> pl.DataFrame:
 
 
 def _gyro_constants(tables: Tables, s: LoggedValues) -> tuple[Array, Array] | None:
-    """The joint estimate's constants, else output error's, equation error's, what the logged unit says, or None."""
+    """The joint estimate's constants, else output error's, equation error's, the logged unit's, or None."""
     found = constants(tables["joint"], Sensor.GYROSCOPE) if "joint" in tables else None
     if found is not None:
         return found
@@ -165,7 +165,7 @@ def vps_attitude(q: Array, s: VpsAttitude) -> Array:
 def _aligned(
     t_vps: Array, q_vps: Array, t_imu: Array, rate: Array, tables: Tables, s: VpsClock, *, calibrated: bool
 ) -> tuple[dict[str, Array], dict[str, Json]]:
-    """VPS attitude and rate on a uniform grid at its own rate, IMU clock, both constant rotations put in."""
+    """VPS attitude and rate on a uniform grid at its own rate, IMU clock, both constant rotations applied."""
     interval = float(np.median(np.diff(t_vps)))
     rates = by_rates.vps_rates(t_vps, q_vps, interval, max_gap_s=s.vps_max_gap_s)
     t = rates.t

@@ -1,4 +1,4 @@
-"""Warm-up: what one flight says by itself of the gyroscope's zero against temperature."""
+"""Warm-up: the slope of the zeros on temperature from one flight."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 METHOD, PARAMETER = Method.WARM_UP, ZERO_SLOPE
 CURVE = "zero_over_temperature"
-"""What stands in `measured`: the zero as a cubic of temperature, level left out, an axis a row."""
+"""Key in `measured`: the zero as a cubic of temperature without its constant term, an axis a row."""
 
 
 def find_warm_up(tables: Tables, s: WarmUpSettings) -> StageResult:
@@ -69,7 +69,7 @@ def _rows(sensor: Sensor, found: warm_up.WarmUp, s: WarmUpSettings) -> list[Cali
 
 
 def _resting(tables: Tables, s: WarmUpSettings, t: Array, rate: Array, warm: Array) -> warm_up.WarmUp | None:
-    """The accelerometer at rest; None without readings that can be trusted, constants, or such a rest."""
+    """The accelerometer's warm-up at rest; None without constants or such a rest, and where it is faulty."""
     calibrated = constants(tables["accelerometer"], Sensor.ACCELEROMETER) if "accelerometer" in tables else None
     if calibrated is None or not is_sound(tables, "accelerometer"):
         return None
