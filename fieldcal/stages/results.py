@@ -171,7 +171,7 @@ def plain(value: object) -> Json:
     Raises
     ------
     TypeError
-        JSON has no word for it.
+        It is, or holds, something that JSON cannot express.
     """
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
