@@ -47,6 +47,8 @@ def test_li_and_griffiths_is_the_constrained_least_squares(noisy: np.ndarray, fu
     theta = vectors[:, np.argmax(values.real)].real
     assert (values.real > 1e-12).sum() == 1
     check_same_surface(quadric.li_griffiths(noisy, full=full), theta, full)
+    if not full:
+        check_same_surface(quadric.li_griffiths(noisy), theta, full)
 
 
 def test_total_least_squares_is_the_least_eigenvalue_of_the_scaled_regressors(noisy: np.ndarray) -> None:
@@ -98,8 +100,12 @@ def test_a_cylinder_is_refused_and_a_long_ellipsoid_is_not() -> None:
     with pytest.raises(UnusableFlight, match="plane or an open surface") as refused:
         quadric.triad_of_quadric(flat, -1.0)
     assert refused.value.measured["quadric_eigenvalues"] == [0.0, 1.0, 1.0]
-    scale, _ = quadric.triad_of_quadric(np.r_[1.0, 1.0, 1e-10, np.zeros(6)], -1.0)
-    np.testing.assert_allclose(np.diagonal(scale), [1.0, 1.0, 1e-5])
+    for size in (0.25, 1.0, 4.0):
+        for flat in (0.9e-12, 1e-12):
+            with pytest.raises(UnusableFlight, match="plane or an open surface"):
+                quadric.triad_of_quadric(np.r_[size, size, size * flat, np.zeros(6)], -size)
+        scale, _ = quadric.triad_of_quadric(np.r_[size, size, size * 1.05e-12, np.zeros(6)], -size)
+        np.testing.assert_allclose(np.diagonal(scale), [1.0, 1.0, np.sqrt(1.05e-12)])
 
 
 def test_readings_in_a_plane_have_no_sphere_and_a_stuck_axis_no_ellipsoid() -> None:

@@ -10,7 +10,7 @@ import pytest
 from mcap_ros2._dynamic import generate_dynamic
 
 from fieldcal.logs.encodings.decoded import Decoded, MissingField, UnsupportedSchema, Want
-from fieldcal.logs.encodings.ros2_cdr import CdrDecoder
+from fieldcal.logs.encodings.ros2_cdr import CdrDecoder, Pick
 
 CODES = {
     "bool": "B", "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i",
@@ -220,6 +220,58 @@ def test_a_message_is_read_exactly_where_it_holds_what_is_wanted(frame: list[byt
     assert decoded.kept.tolist() == np.flatnonzero(whole).tolist()
     truth = {"rate": [7.25, 7.0, -7.0], "mag": [1.0, 2.0, 3.0], "last": 3.0}[wanted]
     np.testing.assert_array_equal(decoded.values["wanted"], [truth] * sum(whole))
+
+
+def test_messages_at_the_end_of_the_buffer_are_not_read_beyond_it() -> None:
+    sound = imu(7, [1.0, 2.0, 3.0], frame=b"abc")
+    for size in range(len(sound)):
+        decoded = decode([sound, sound[:size]], DEFINITION, {"last": Want.of("last", 1)}, gap=0)
+        assert decoded.kept.tolist() == [0]
+
+
+def test_two_encapsulations_come_back_in_order() -> None:
+    messages = [imu(row, [], kind) for row, kind in enumerate([b"\0\7", b"\0\1", b"\0\7"])]
+    decoded = decode(messages, DEFINITION, {"rate": Want.of("rate", 3)})
+    assert decoded.kept.tolist() == [0, 1, 2]
+    np.testing.assert_array_equal(decoded.values["rate"][:, 1], [0.0, 1.0, 2.0])
+
+
+def test_the_longest_want_of_a_sequence_says_how_long_it_is() -> None:
+    messages = [imu(0, [1.0, 2.0, 3.0]), imu(1, [4.0, 5.0, 6.0, 7.0])]
+    decoded = decode(messages, DEFINITION, {"three": Want.of("mag", 3), "four": Want.of("mag", 4)})
+    assert decoded.kept.tolist() == [1]
+    np.testing.assert_array_equal(decoded.values["three"], [[4.0, 5.0, 6.0]])
+    np.testing.assert_array_equal(decoded.values["four"], [[4.0, 5.0, 6.0, 7.0]])
+
+
+def test_neighbouring_numbers_are_gathered_at_once() -> None:
+    """The fast path: one gather for each stretch of a value's numbers that lie side by side."""
+    definition = "float64 w\nfloat64 x\nfloat64 y\nfloat64 z\nint8 k\nfloat64[3] v"
+    wants = {
+        "apart": Want.of(("z", "x", "y"), 3),
+        "next": Want.of(("x", "y", "z"), 3),
+        "split": Want.of(("y", "z", "k"), 3),
+        "w": Want.of("w", 1),
+        "own_x": Want.of("x", 1),
+        "v": Want.of("v", 3),
+    }
+    assert CdrDecoder("my_msgs/msg/Any", definition, wants)._picks == [
+        Pick(0, 3, 1, "apart", 0),
+        Pick(0, 1, 2, "apart", 1),
+        Pick(0, 1, 3, "next", 0),
+        Pick(0, 2, 2, "split", 0),
+        Pick(1, 0, 1, "split", 2),
+        Pick(0, 0, 1, "w", 0),
+        Pick(0, 1, 1, "own_x", 0),
+        Pick(2, 0, 3, "v", 0),
+    ]
+
+
+def test_half_a_stamp_is_none() -> None:
+    definition = "Clock stamp\nint8 x\n===\nMSG: my_msgs/Clock\nint32 sec"
+    decoded = decode([b"\0\1\0\0" + struct.pack("<ib", 3, 7)], definition, {"x": Want.of("x", 1)})
+    assert decoded.stamp_ns is None
+    assert decoded.values["x"].tolist() == [7.0]
 
 
 def test_lengths_that_lie_cost_their_own_message() -> None:

@@ -69,6 +69,11 @@ def test_a_line_that_is_none_is_quoted(text: str) -> None:
         leaves(text)
 
 
+def test_of_a_long_line_the_beginning_is_quoted() -> None:
+    with pytest.raises(DefinitionError, match=r"line '\?{80}' is not understood"):
+        leaves("?" * 200)
+
+
 def test_a_missing_definition_is_named_with_its_owner() -> None:
     with pytest.raises(DefinitionError, match="my_msgs/Any contains a Thing"):
         leaves("Thing x")
@@ -89,8 +94,9 @@ def test_nesting_is_followed_as_deep_as_the_cap() -> None:
 def test_so_many_values_are_followed_and_no_more() -> None:
     wide = "Wide[{}] many\n===\nMSG: my_msgs/Wide\nint8 a"
     assert len(leaves(wide.format(definitions.LEAVES_CAP + 1))) == definitions.LEAVES_CAP + 1
-    with pytest.raises(DefinitionError, match="without end"):
-        leaves("Wide[20001] many\nWide more\n===\nMSG: my_msgs/Wide\nint8 a")
+    for more in ("Wide[20001] many\nWide more", "Wide[20002] many", f"Wide[{'9' * 40}] many"):
+        with pytest.raises(DefinitionError, match="without end"):
+            leaves(more + "\n===\nMSG: my_msgs/Wide\nint8 a")
 
 
 @pytest.mark.parametrize("name", ["sensor_msgs/msg/Imu", "sensor_msgs.msg.Imu", "sensor_msgs/Imu", "/sensor_msgs//Imu"])
