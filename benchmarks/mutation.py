@@ -6,7 +6,8 @@
     python benchmarks/mutation.py --module exports --sample 40    # a room
 
 Needs the `test` extra and a system with fork. Nothing is written to the checkout: the changed module lives in the
-memory of a forked process. First a module's own tests (`TESTS`) run unchanged, and it is noted which of them pass
+memory of a forked process. First a module's own tests (`TESTS` in
+`mutation_table.py`) run unchanged, and it is noted which of them pass
 through which line; a change is then shown to the tests of its line, the quickest first, until one fails. Tests are
 collected once a module, and functions get the changed code in a copy of that process: a fraction of a second a change.
 What runs at import (constants, defaults) is imported anew: some seconds.
@@ -14,7 +15,7 @@ What runs at import (constants, defaults) is imported anew: some seconds.
 A *survivor* is a change that no test noticed. Either the tests miss something: write one that kills it, against a truth
 that does not come from the module (a closed form, another library, the simulator), never against yesterday's output. Or
 the code does nothing there: delete it. Or the change can't be seen from outside, because both forms give the same for
-every input: add it to `EQUIVALENT` with the reason. No more than 1 in 20 may live, equivalents aside.
+every input: add it to `EQUIVALENT` there, with the reason. No more than 1 in 20 may live, equivalents aside.
 
 A fast path needs tests of its own that fail when it is not taken: behind it stands a slow one that gives the same.
 """
@@ -46,6 +47,7 @@ from types import CodeType, FrameType, FunctionType
 from typing import Any
 
 import pytest
+from mutation_table import EQUIVALENT, TESTS
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGE = REPOSITORY / "fieldcal"
@@ -55,99 +57,6 @@ MEMORY_BYTES = 4 << 30
 LEAST_TIMEOUT_S = 20
 WHOLE_TIMEOUT_S = 24 * 3600
 ALIVE_SHARE = 1 / 20
-
-TESTS: dict[str, Sequence[str]] = {
-    "logs.mcap.chunks": ("logs/test_mcap_chunks.py",),
-    "logs.mcap": ("logs/test_mcap_*.py", "logs/test_logs_mcap*.py", "logs/test_logs_protobuf.py"),
-    "logs.csv": ("logs/test_csv_*.py", "logs/test_logs_csv*.py"),
-    "logs.encodings": ("logs/test_encodings*.py", "logs/test_logs_mcap.py", "logs/test_logs_protobuf.py"),
-    "logs.stamps": ("logs/test_stamps.py",),
-    "logs.tidy": ("logs/test_tidy*.py", "logs/test_stamps.py"),
-    "exports": ("exports/test_*.py",),
-    "geometry.earth_field": ("geometry/test_earth_field.py",),
-    "geometry.intervals": ("geometry/test_*.py",),
-    "geometry.rotation": ("geometry/test_rotation.py",),
-    "geometry.sensor_model": ("geometry/test_sensor_model.py",),
-    "estimation.clock_sync": ("estimation/test_clock_*.py",),
-    "estimation.ellipsoid": ("estimation/test_ellipsoid*.py",),
-    "estimation.faults": ("estimation/test_faults*.py",),
-    "estimation.gyroscope.equation_error": ("estimation/test_equation_error*.py",),
-    "estimation.gyroscope.output_error": ("estimation/test_output_error*.py",),
-    "estimation.gyroscope.regressor_noise": ("estimation/test_regressor_noise*.py",),
-    "estimation.motion_selection": ("estimation/test_motion_selection*.py",),
-    "estimation.motor_field": ("estimation/test_motor_field*.py",),
-    "estimation.robust": ("estimation/test_robust*.py",),
-    "estimation.segments": ("estimation/test_segments*.py",),
-    "estimation.smoothing": ("estimation/test_smoothing*.py",),
-    "estimation.statistics": ("estimation/test_statistics*.py",),
-    "estimation.theil": ("estimation/test_theil*.py",),
-    "estimation.wahba": ("estimation/test_wahba*.py",),
-    "estimation.warm_up": ("estimation/test_warm_up*.py",),
-    "estimation.joint": ("estimation/joint/test_*.py",),
-}
-"""Module, or room of modules, below fieldcal → its own tests below tests/. The longest name counts."""
-
-_AT_A_TIME = "how much is worked on at a time; the result is the same"
-_ROOM = "room that is filled up to `filled`, which is what is returned"
-_LENGTH = "a transform may be longer than what it transforms"
-_ANY_NEGATIVE = "NumPy takes any negative length for the one that is left over"
-_REFUSED_NEXT = "what the bound lets pass is refused by the end of the last message, two checks on"
-_SPARE_SAMPLES = "spare samples of the padding lie beyond the filter's reach"
-_THREE_TAKEN = "columns_of takes the three of the axes"
-
-EQUIVALENT: dict[tuple[str, str, str], str] = {
-    ("estimation.smoothing", "before, after = x[side:0:-1], x[-2 : -side - 2 : -1]", "2 → 3"): _SPARE_SAMPLES,
-    ("estimation.smoothing", "size = fft.next_fast_len(len(padded) + 2 * side, real=True)", "True → False"): _LENGTH,
-    ("estimation.smoothing", "size = fft.next_fast_len(len(padded) + 2 * side, real=True)", "2 → 3"): _LENGTH,
-    ("estimation.smoothing", "shape = (-1,) + (1,) * (x.ndim - 1)", "1 → 2"): _ANY_NEGATIVE,
-    (
-        "exports.apply",
-        "values = c.readings[name][1] if name in own else np.full((len(t_ns), 3), np.nan)",
-        "3 → 4",
-    ): _THREE_TAKEN,
-    (
-        "exports.apply",
-        "nothing = np.full((len(either[0]), 3), np.nan)",
-        "0 → 1",
-    ): "stamps and readings are equally many",
-    ("exports.apply", 'origin = int(known["t_ns"][0])', "0 → 1"): "an origin near the stamps, for the digits alone",
-    ("logs.mcap.chunks", "ZSTD_WINDOW_CAP_BYTES = 128 << 20", "<< → >>"): "0 stands for Zstandard's own cap: the same",
-    (
-        "logs.mcap.chunks",
-        "ZSTD_WINDOW_CAP_BYTES = 128 << 20",
-        "128 → 140",
-    ): "the next window that a frame can name has 144 MiB",
-    ("logs.mcap.chunks", "_PIECE_BYTES = 1 << 20", "1 → 2"): _AT_A_TIME,
-    ("logs.mcap.chunks", "_PIECE_BYTES = 1 << 20", "20 → 22"): _AT_A_TIME,
-    ("logs.mcap.chunks", "_FED_BYTES = 1 << 16", "1 → 2"): _AT_A_TIME,
-    ("logs.mcap.chunks", "_FED_BYTES = 1 << 16", "16 → 17"): _AT_A_TIME,
-    ("logs.mcap.chunks", "content, filled, position = bytearray(size + 1), 0, 0", "1 → 2"): _ROOM,
-    ("logs.mcap.chunks", "content, filled, position = bytearray(size + 1), 0, 0", "+ → -"): _ROOM,
-    ("logs.mcap.chunks", "content[filled : filled + len(piece)] = piece", "+ → -"): _ROOM,
-    ("logs.mcap.chunks", "room = data.size - HEAD_BYTES - MESSAGE_HEAD_BYTES", "- → +"): _REFUSED_NEXT,
-    (
-        "logs.mcap.chunks",
-        "if np.any(data[starts] != MESSAGE) or int(sizes.max()) > data.size or int(sizes.min()) < MESSAGE_HEAD_BYTES:",
-        "> → >=",
-    ): _REFUSED_NEXT,
-    (
-        "logs.mcap.chunks",
-        "reader = decompressor.stream_reader(packed, read_across_frames=True)",
-        "True → False",
-    ): "the loop reads on behind the end of a frame, until nothing comes",
-    ("logs.tidy", "MOST_INTERVALS = 1 << 20", "1 → 2"): _AT_A_TIME,
-    ("logs.tidy", "MOST_INTERVALS = 1 << 20", "20 → 22"): _AT_A_TIME,
-    ("logs.tidy", "while self._intervals.size > MOST_INTERVALS:", "> → >="): _AT_A_TIME,
-    ("logs.tidy", "self._n_late = 0", "0 → 1"): "the first stamp of all is behind none, which begins the count anew",
-    (
-        "logs.tidy",
-        "self.longest_gap_ns = max(self.longest_gap_ns, int(intervals.max(initial=0)))",
-        "0 → 1",
-    ): "told from a second on",
-    ("logs.stamps", "AT_ONCE = 1 << 17", "1 → 2"): _AT_A_TIME,
-    ("logs.stamps", "AT_ONCE = 1 << 17", "17 → 18"): _AT_A_TIME,
-}
-"""(module, the line without its indentation, the change) → why no caller can tell the difference."""
 
 _SWAPS: dict[type[ast.AST], type[ast.AST]] = {
     ast.Add: ast.Sub,
@@ -192,10 +101,12 @@ PRELOADED = (
 
 @dataclass(frozen=True)
 class Change:
-    """One place of a module, and what becomes of it. `number` counts the places as they are walked."""
+    """One place of a module, and what becomes of it. `number` counts the places as they are walked; `where` names the
+    function or class around it."""
 
     module: str
     number: int
+    where: str
     line: int
     last_line: int
     at_import: bool
@@ -283,11 +194,22 @@ def source_of(module: str) -> Path:
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
+def names_around(node: ast.AST, where: str = "") -> Iterator[tuple[int, str]]:
+    """Identity of every node below `node`, and the dotted name of the function or class that it stands in."""
+    for child in ast.iter_child_nodes(node):
+        own = f"{where}.{child.name}".lstrip(".") if isinstance(child, ast.FunctionDef | ast.ClassDef) else where
+        yield id(child), own
+        yield from names_around(child, own)
+
+
 def changes_of(module: str) -> list[Change]:
     """Every change of a module."""
     found = []
-    for number, (node, at_import, what, _) in enumerate(places(ast.parse(source_of(module).read_text()))):
-        found.append(Change(module, number, node.lineno, node.end_lineno or node.lineno, at_import, what))
+    tree = ast.parse(source_of(module).read_text())
+    around = dict(names_around(tree))
+    for number, (node, at_import, what, _) in enumerate(places(tree)):
+        end = node.end_lineno or node.lineno
+        found.append(Change(module, number, around[id(node)], node.lineno, end, at_import, what))
     return sorted(found, key=lambda change: change.line)
 
 
@@ -517,9 +439,15 @@ def line_of(change: Change) -> str:
     return source_of(change.module).read_text().splitlines()[change.line - 1].strip()
 
 
+def key_of(change: Change) -> tuple[str, str, str, str]:
+    """What names the change in `EQUIVALENT`."""
+    return change.module, change.where, line_of(change), change.what
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--module", action="append", default=[], help="a module or a room below fieldcal; repeatable")
+    parser.add_argument("--without", action="append", default=[], help="a module or a room to leave out; repeatable")
     parser.add_argument("--line", type=int, help="only changes of this line of the module")
     parser.add_argument("--sample", type=int, help="as many changes, drawn evenly from all; all without it")
     parser.add_argument("--seed", type=int, default=1)
@@ -527,20 +455,23 @@ def main() -> None:
     arguments = parser.parse_args()
 
     prepare()
-    names = modules_of(arguments.module)
+    left_out = set(modules_of(arguments.without)) if arguments.without else set()
+    names = [name for name in modules_of(arguments.module) if name not in left_out]
     drawn = [c for name in names for c in changes_of(name) if arguments.line in (None, c.line)]
+    if arguments.line is None and (gone := {key for key in EQUIVALENT if key[0] in names} - {*map(key_of, drawn)}):
+        raise SystemExit("EQUIVALENT names changes that are no more:\n" + "\n".join(map(str, sorted(gone))))
     if arguments.sample is not None and arguments.sample < len(drawn):
         drawn = sorted(
             random.Random(arguments.seed).sample(drawn, arguments.sample), key=lambda c: (c.module, c.number)
         )
     if not drawn:
-        raise SystemExit(f"Nothing to change in {arguments.module}; the modules are those of TESTS in this script.")
+        raise SystemExit(f"Nothing to change in {arguments.module}; the modules are those of TESTS.")
     scores: dict[str, Score] = {}
     for module, changes in itertools.groupby(drawn, key=lambda c: c.module):
         known: list[Change] = []
         unknown: list[Change] = []
         for change in changes:
-            (known if (module, line_of(change), change.what) in EQUIVALENT else unknown).append(change)
+            (known if key_of(change) in EQUIVALENT else unknown).append(change)
         alive = survivors(module, unknown, arguments.patience)
         score = scores[module] = Score(len(unknown) - len(alive), len(known), alive)
         for change in sorted(alive, key=lambda c: c.line):

@@ -25,7 +25,7 @@ def triad_of_quadric(theta: Array, offset: float) -> tuple[Array, Array]:
     q = np.array(
         [[theta[0], theta[5], theta[4]], [theta[5], theta[1], theta[3]], [theta[4], theta[3], theta[2]]], dtype=float
     )
-    p = theta[6:9]
+    p = theta[6:]
     if np.trace(q) < 0:
         q, p, offset = -q, -p, -offset
     lengths, axes = np.linalg.eigh(q)

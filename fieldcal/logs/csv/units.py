@@ -93,7 +93,7 @@ def _bracketed(column: str) -> str | None:
 
 def _by_suffix(column: str, known: dict[str, str]) -> str | None:
     lowered = column.strip().lower()
-    for name in sorted(known, key=len, reverse=True):
+    for name, unit in known.items():
         if len(name) < len(lowered) - 1 and lowered.endswith("_" + name):
-            return known[name]
+            return unit
     return None

@@ -70,7 +70,7 @@ def _numbers(message: Json, want: Want) -> list[float]:
     else:
         raise TypeError("neither an array nor an object")
     if len(parts) != want.width:
-        raise ValueError(f"{want.paths[0]} holds {len(parts)} numbers, not {want.width}")
+        raise ValueError(f"not {want.width} numbers")
     return [_number(part) for part in parts]
 
 

@@ -87,7 +87,7 @@ class ProtobufDecoder:
         paths = want.paths
         if len(paths) == 1 and want.width > 1:
             parts = tuple(f"{paths[0]}.{component}" for component in COMPONENTS[want.width])
-            paths = parts if all(self._has(part) for part in parts) else paths
+            paths = parts if any(self._has(part) for part in parts) else paths
         for path in paths:
             if not self._has(path):
                 raise MissingField(path, [field.name for field in self._message_class.DESCRIPTOR.fields])

@@ -99,7 +99,7 @@ def _parse(name: str, text: str) -> dict[str, list[_Field]]:
     for number, part in enumerate(_SEPARATOR.split(text)):
         lines = part.strip().splitlines()
         if number and lines and lines[0].startswith("MSG:"):
-            definitions[short_name(lines[0][4:].strip())] = _fields("\n".join(lines[1:]))
+            definitions[short_name(lines[0].removeprefix("MSG:").strip())] = _fields("\n".join(lines[1:]))
         elif number == 0:
             definitions[name] = _fields(part)
     return definitions
@@ -108,7 +108,7 @@ def _parse(name: str, text: str) -> dict[str, list[_Field]]:
 def _fields(text: str) -> list[_Field]:
     fields = []
     for line in text.splitlines():
-        content = line.split("#", 1)[0].strip()
+        content = line.partition("#")[0].strip()
         if not content:
             continue
         match = _FIELD.match(content)
@@ -140,7 +140,7 @@ def _expand(name: str, prefix: str, definitions: dict[str, list[_Field]], leaves
             leaves.append(Opaque(path))
         else:
             nested = _resolve(field.type_name, name, definitions)
-            for number in range(min(repeat, LEAVES_CAP + 1)):
+            for number in range(repeat):
                 inner = path if field.array is None else f"{path}[{number}]"
                 _expand(nested, inner + ".", definitions, leaves, depth + 1)
 

@@ -1,0 +1,259 @@
+"""Clock and outliers at their limits: each threshold from both sides, each refusal by its own cause."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from fieldcal.errors import UnusableFlight
+from fieldcal.estimation.clock_sync import by_rates
+from fieldcal.geometry.rotation import from_rotation_vector, multiply
+from fieldcal.simulation.experiment import Experiment, Motion
+
+X = np.array([1.0, 0.0, 0.0])
+
+
+def turned(angles: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Attitudes (n, 4) turned about x."""
+    return from_rotation_vector(np.asarray(angles)[:, None] * X)
+
+
+def masked(t: np.ndarray, angles: np.ndarray, **options: float) -> list[int]:
+    return np.flatnonzero(~by_rates.mask_outliers(t, turned(angles), **options)).tolist()
+
+
+def swinging(step: float, excursion: float, at: int = 20, n: int = 41) -> np.ndarray:
+    """± step / 2 in turn, so that every attitude is `step` off its neighbours' line; one goes further."""
+    angles = 0.5 * step * np.where(np.arange(n) % 2 == 0, 1.0, -1.0)
+    angles[at] += excursion
+    return angles
+
+
+# masking -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("off", "gone"), [(1.9e-3, []), (2.1e-3, [20])])
+def test_two_milliradians_off_a_quiet_line_are_an_outlier(off: float, gone: list[int]) -> None:
+    assert masked(np.arange(41) * 0.01, swinging(0.0, off)) == gone
+
+
+@pytest.mark.parametrize(("sigmas", "gone"), [(9.8, []), (10.2, [20])])
+def test_ten_sigma_off_the_line_are_an_outlier(sigmas: float, gone: list[int]) -> None:
+    step = 0.02
+    sigma = 1.4826 * step  # of deviations that are all alike
+    assert masked(np.arange(41) * 0.01, swinging(step, sigmas * sigma - step)) == gone
+
+
+@pytest.mark.parametrize("rate", [20.0, 40.0])
+@pytest.mark.parametrize(("share", "gone"), [(0.98, []), (1.03, [20])])
+def test_there_and_back_faster_than_any_vehicle_is_an_outlier(rate: float, share: float, gone: list[int]) -> None:
+    """Two milliradians are allowed on top; within ten sigma all the while."""
+    interval, step = 1.0 / 350.0, 0.02
+    excursion = share * (rate * interval + 2e-3) - step
+    assert masked(np.arange(41) * interval, swinging(step, excursion), max_rate=rate) == gone
+    if rate == 40.0:
+        assert masked(np.arange(41) * interval, swinging(step, excursion)) == gone
+
+
+@pytest.mark.parametrize(("share", "gone"), [(0.98, []), (1.02, [20])])
+def test_stamps_that_crowd_count_as_a_tenth_of_a_millisecond(share: float, gone: list[int]) -> None:
+    step = 0.002
+    excursion = share * (40.0 * 1e-4 + 2e-3) - step
+    assert masked(np.arange(41) * 2e-5, swinging(step, excursion)) == gone
+
+
+def test_a_length_five_per_cent_off_is_no_attitude() -> None:
+    t, q = np.arange(41) * 0.01, turned(np.zeros(41))
+    for place, length in ((5, 1.04), (10, 1.06), (15, 0.96), (20, 0.94)):
+        q[place] *= length
+    assert np.flatnonzero(~by_rates.mask_outliers(t, q)).tolist() == [10, 20]
+
+
+def test_of_four_attitudes_none_is_judged_and_of_five_one_is() -> None:
+    assert masked(np.arange(4) * 0.01, np.array([0.0, 0.0, 1.0, 0.0])) == []
+    assert masked(np.arange(5) * 0.01, np.array([0.0, 0.0, 1.0, 0.0, 0.0])) == [2]
+
+
+def test_the_line_between_neighbours_is_taken_at_the_stamp() -> None:
+    """A steady turn with one stamp far from the middle of its neighbours is on the line; by index it is not."""
+    t = np.arange(41) * 0.01
+    t[20] += 0.006
+    assert masked(t, 3.0 * t) == []
+    assert masked(t, 3.0 * np.arange(41) * 0.01) == [20]
+
+
+# grids ---------------------------------------------------------------------------------------------------------------
+
+
+def test_gaps_of_a_twentieth_and_a_tenth_of_a_second_are_crossed_and_longer_ones_are_not() -> None:
+    def vps(t: np.ndarray) -> by_rates.UniformRates:
+        return by_rates.vps_rates(t, turned(t), 0.01)
+
+    def imu(t: np.ndarray) -> by_rates.UniformRates:
+        return by_rates.imu_rates(t, np.ones((len(t), 3)), 0.01)
+
+    for rates, gap in ((vps, 0.05), (imu, 0.1)):
+        for length, crossed in ((0.99 * gap, True), (1.02 * gap, False)):
+            t = np.r_[np.arange(0.0, 1.0, 0.01), 0.99 + length + np.arange(0.0, 1.0, 0.01)]
+            assert rates(t).valid.all() == crossed
+
+
+def test_a_gap_spoils_the_four_places_on_either_side() -> None:
+    """Nine samples are what the derivative is taken from."""
+    t = np.r_[np.arange(0.0, 1.0, 0.01), np.arange(1.5, 2.5, 0.01)]
+    found = by_rates.vps_rates(t, turned(t), 0.01)
+    bad = np.flatnonzero(~found.valid)
+    within = np.flatnonzero((found.t > 0.99 + 1e-9) & (found.t < 1.5 - 1e-9))
+    assert bad[0] in (within[0] - 4, within[0] - 5)
+    assert bad[-1] in (within[-1] + 4, within[-1] + 5)
+    np.testing.assert_allclose(found.rate[found.valid], np.tile(X, (found.valid.sum(), 1)), atol=1e-4)
+    assert len(found.t) == len(found.rate) == 249
+
+
+def test_rates_between_stamps_are_linear_and_end_with_the_record() -> None:
+    t = np.array([5.0, 5.03, 5.05, 5.1])
+    found = by_rates.imu_rates(t, np.stack([t, 2.0 * t, -t], axis=1), 0.02)
+    np.testing.assert_allclose(found.t, [5.0, 5.02, 5.04, 5.06, 5.08][: len(found.t)])
+    assert len(found.t) in (4, 5)
+    np.testing.assert_allclose(found.rate, np.stack([found.t, 2.0 * found.t, -found.t], axis=1))
+
+
+def test_what_the_filter_mixes_with_a_gap_or_an_end_is_masked() -> None:
+    """Half a period of 8 Hz on either side: six samples of a hundredth of a second."""
+    valid = np.ones(200, dtype=bool)
+    valid[100] = False
+    found = by_rates._smoothed(by_rates.UniformRates(0.0, 0.01, np.ones((200, 3)), valid))
+    expected = np.ones(200, dtype=bool)
+    expected[[*range(6), *range(94, 107), *range(194, 200)]] = False
+    np.testing.assert_array_equal(found.valid, expected)
+
+
+# correlation ---------------------------------------------------------------------------------------------------------
+
+
+def uniform(norms: np.ndarray, start: float = 0.0) -> by_rates.UniformRates:
+    return by_rates.UniformRates(start, 0.1, norms[:, None] * X, np.ones(len(norms), dtype=bool))
+
+
+@pytest.mark.parametrize(
+    ("n", "shift", "counts"), [(200, 148, True), (200, 152, False), (60, 29, True), (60, 31, False)]
+)
+def test_only_lags_with_enough_overlap_count(n: int, shift: int, counts: bool) -> None:
+    """Fifty samples, 5 s, or half of the shorter record where that is less."""
+    rng = np.random.default_rng(0)
+    a = np.abs(rng.normal(size=n))
+    b = np.r_[np.abs(rng.normal(size=shift)), a][:n]
+    lag, peak, _, _ = by_rates.correlate(uniform(a), uniform(b), 60.0)
+    assert (peak > 0.999 and lag == pytest.approx(-0.1 * shift, abs=0.05)) == counts
+
+
+def test_the_peaks_width_and_the_best_correlation_beside_it() -> None:
+    """A triangle of 21 samples in a long quiet record correlates with itself over a known neighbourhood; a copy of half
+    its height elsewhere is the runner-up."""
+    a = np.zeros(600)
+    a[100:121] = 10.0 - np.abs(np.arange(-10, 11))
+    b, twice = a.copy(), a.copy()
+    twice[400:421] += 0.5 * a[100:121]
+    lag, peak, runner_up, width = by_rates.correlate(uniform(a), uniform(b, 3.0), 60.0)
+    assert lag == pytest.approx(-3.0, abs=1e-9)
+    assert peak == pytest.approx(1.0)
+
+    def correlation(x: np.ndarray, y: np.ndarray, shift: int) -> float:
+        u, v = (x[shift:], y[: len(y) - shift]) if shift >= 0 else (x[:shift], y[-shift:])
+        return float(np.corrcoef(u, v)[0, 1])
+
+    shifts = range(-40, 41)
+    r = np.array([correlation(a, b, shift) for shift in shifts])
+    above = np.flatnonzero(r >= 0.5)
+    assert width == pytest.approx(0.1 * (above[-1] - above[0] + 2))
+    assert runner_up == pytest.approx(r[above[0] - 1 : above[-1] + 2].min(), abs=0.2)
+    _, peak, runner_up, _ = by_rates.correlate(uniform(twice), uniform(a), 60.0)
+    # The smaller copy alone is a perfect match: means and norms are those of what overlaps.
+    assert peak == pytest.approx(correlation(twice, a, 300), abs=1e-9)
+    assert runner_up == pytest.approx(correlation(twice, a, 0), abs=1e-9)
+
+
+def test_a_fractional_lag_is_the_top_of_the_parabola() -> None:
+    t = np.arange(0.0, 60.0, 0.1)
+
+    def pulse(at: float) -> np.ndarray:
+        return np.exp(-0.5 * ((t - at) / 0.8) ** 2)
+
+    for off in (-0.04, 0.013, 0.05):
+        lag, _, _, _ = by_rates.correlate(uniform(pulse(30.0)), uniform(pulse(30.0 - off)), 20.0)
+        assert lag == pytest.approx(off, abs=0.002)
+
+
+# whole ---------------------------------------------------------------------------------------------------------------
+
+IMU_S, VPS_S = 1.0 / 185.0, 1.0 / 350.0
+
+
+def record(duration_s: float = 30.0, skew_ppm: float = 0.0) -> tuple[np.ndarray, ...]:
+    rng = np.random.default_rng(0)
+    motion = Motion(Experiment(seed=0, duration_s=duration_s, sets=2), rng)
+    t, t_vps = np.arange(0.0, duration_s, IMU_S), np.arange(0.0, duration_s, VPS_S)
+    rate = motion.rate(t) + 0.005 * rng.normal(size=(len(t), 3))
+    q = multiply(motion.attitude(t_vps), from_rotation_vector(3e-5 * rng.normal(size=(len(t_vps), 3))))
+    return t, rate, t_vps * (1 + 1e-6 * skew_ppm), q
+
+
+@pytest.mark.parametrize(("skew_ppm", "accepted"), [(1900.0, True), (2100.0, False), (-1900.0, True), (-2100.0, False)])
+def test_clocks_that_drift_apart_by_more_than_two_milliseconds_a_second_are_not_the_same_motion(
+    skew_ppm: float, accepted: bool
+) -> None:
+    if accepted:
+        assert by_rates.synchronise(*record(skew_ppm=skew_ppm)).skew_ppm == pytest.approx(skew_ppm, abs=15.0)
+        return
+    with pytest.raises(UnusableFlight) as refused:
+        by_rates.synchronise(*record(skew_ppm=skew_ppm))
+    assert refused.value.reason_code == "not_the_same_motion"
+    assert refused.value.measured["skew_ppm"] == pytest.approx(skew_ppm, abs=15.0)
+    assert f"drift of {refused.value.measured['skew_ppm']:.0f} ppm" in refused.value.sentence
+
+
+def test_the_least_peak_is_the_callers() -> None:
+    t, rate, stamps, q = record()
+    noisy = rate + 0.6 * np.random.default_rng(1).normal(size=rate.shape)
+    peak = by_rates.synchronise(t, noisy, stamps, q, min_peak=0.0).peak
+    assert 0.5 < peak < 0.99
+    assert by_rates.synchronise(t, noisy, stamps, q, min_peak=0.999 * peak).peak == peak
+    with pytest.raises(UnusableFlight) as refused:
+        by_rates.synchronise(t, noisy, stamps, q, min_peak=1.001 * peak)
+    assert refused.value.reason_code == "flat_peak"
+
+
+def code(*arrays: np.ndarray, **options: float) -> str:
+    try:
+        by_rates.synchronise(*arrays, **options)
+    except UnusableFlight as refused:
+        return str(refused.reason_code)
+    return "synchronised"
+
+
+def test_how_short_a_record_may_be() -> None:
+    """Fifty samples of either, two seconds of the VPS."""
+    t, rate, stamps, q = record(10.0)
+    few = slice(0, None, 17)  # 0.0486 s apart
+    for n, short in ((49, True), (50, False)):
+        assert (code(t, rate, stamps[few][:n], q[few][:n]) == "vps_too_short") == short
+        assert (code(t[:n], rate[:n], stamps, q) == "vps_too_short") == short
+    for duration_s, short in ((1.99, True), (2.01, False)):
+        part = stamps <= duration_s
+        assert (code(t, rate, stamps[part], q[part]) == "vps_too_short") == short
+
+
+def test_stamps_on_either_clock() -> None:
+    """t_vps = (t_imu − ref)(1 + skew) + ref − lag, there and back; the lag at the first sample is on that line."""
+    fit = by_rates.SyncFit(
+        lag_mid_s=-0.4, skew_ppm=2e5, covariance=np.diag([4e-6, 9e-12]), peak=1.0, runner_up=0.0, peak_width_s=1.0,
+        explained=1.0, matrix=np.eye(3), reference_s=15.0, first_s=10.0,
+    )  # fmt: skip
+    t = np.array([10.0, 15.0, 20.0])
+    vps = (t - 15.0) * 1.2 + 15.0 + 0.4
+    np.testing.assert_allclose(fit.to_imu_clock(vps), t)
+    assert fit.lag_s == pytest.approx(t[0] - vps[0])
+    assert fit.lag_sd_s == pytest.approx(2e-3)
+    assert fit.skew_sd_ppm == pytest.approx(3.0)
