@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from fieldcal.errors import EstimationError
 from fieldcal.estimation.joint.chain_solver import GRADIENT, Probe, place_knots, whitened_joints
@@ -25,7 +26,7 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import Json
 
 # Score test: χ² exceeded by chance once in a thousand, by degrees of freedom.
-SCORE_CHI2 = {1: 10.8, 3: 16.3, 6: 22.5}
+SCORE_CHI2 = {size: round(float(chdtri(size, 1e-3)), 1) for size in set(TERMS.values())}
 # Least gain of the held-out likelihood over its sd, which comes from at least so many blocks of this length.
 LEAST_GAIN_SD, BLOCK_S, FEWEST_BLOCKS = 3.0, 2.0, 6
 FIT_SHARE = 0.6  # of the record; the rest is held out

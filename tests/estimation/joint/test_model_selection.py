@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from test_joint import own_start, readings, truth
 
 from fieldcal.estimation.joint import initialise
 from fieldcal.estimation.joint.fit import JointFit, fit_joint
-from fieldcal.estimation.joint.model_selection import add_terms, with_zeros
+from fieldcal.estimation.joint.model_selection import SCORE_CHI2, add_terms, with_zeros
 from fieldcal.estimation.joint.problem import TERMS, Model, State
 from fieldcal.names import SENSORS
 from fieldcal.simulation.experiment import NOISE_VARIANCE, SimulatedFlight, simulate
@@ -123,3 +124,8 @@ def test_terms_that_the_record_cannot_show_are_not_tried() -> None:
     assert "gyroscope_temperature" not in {test.name for test in tests}
     still = replace(fit, path=replace(fit.path, rate=fit.path.rate * 1e-3))
     assert not any(test.name.endswith("_delay") for test in add_terms(still)[1])
+
+
+def test_every_term_has_a_limit_that_chance_exceeds_once_in_a_thousand() -> None:
+    for size in TERMS.values():
+        assert chi2.sf(SCORE_CHI2[size], size) == pytest.approx(1e-3, rel=0.03), size
