@@ -18,6 +18,7 @@ from fieldcal.batch.reasons import NO_RESULT, why_it_runs
 from fieldcal.batch.sources import sources
 from fieldcal.config.configuration import Vehicle
 from fieldcal.config.flight_settings import FlightSettings
+from fieldcal.config.reader_settings import reader_settings
 from fieldcal.config.stage_settings import as_json, taken_from
 from fieldcal.errors import UnreadableLog, unforeseen
 from fieldcal.flight.job import Job, file_stamp
@@ -137,9 +138,8 @@ class FlightWork:
     def _params(self, step: str) -> Mapping[str, Json]:
         if step != INGEST:
             return as_json(taken_from(self._known(), STAGES[step].takes))
-        settings = self._vehicle.settings()
         named = {"vehicle_id": self.job.vehicle_id, "name": Path(self.job.path).name}
-        return {**{name: settings[name] for name in ("csv", "mcap", "units")}, **named}
+        return {**reader_settings(self._vehicle), **named}
 
     def _known(self) -> FlightSettings:
         """The flight's settings; there are some once its log was found usable, and no stage runs before."""

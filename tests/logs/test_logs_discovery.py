@@ -11,6 +11,8 @@ from logs_support import vehicle
 from fieldcal.config.configuration import LogsMap
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs import find_logs, flight_id, log_sha256, open_log
+from fieldcal.logs.discovery import LOG_FORMATS
+from fieldcal.schemas.columns import LOG_FORMAT
 
 
 def touch(path: Path, content: str = "x") -> Path:
@@ -45,6 +47,10 @@ def test_logs_are_listed_in_order_with_vehicle_and_session(archive: Path) -> Non
         ("b/s1/one.CSV", "b", "s1", "csv"),
         ("b/s1/two.mcap", "b", "s1", "mcap"),
     ]
+
+
+def test_the_column_names_the_formats_that_discovery_gives() -> None:
+    assert LOG_FORMAT.meaning.split(": ")[1].split(", ") == list(LOG_FORMATS.values())
 
 
 def test_links_out_of_the_archive_and_loops_are_not_followed(archive: Path, tmp_path: Path) -> None:
