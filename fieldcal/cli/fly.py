@@ -12,6 +12,7 @@ from fieldcal.cli.options import AsJson, Config, Output, Root, UnusedConfig
 from fieldcal.reason_codes import ReasonCode
 
 Format = Literal["px4", "ardupilot", "ros", "kalibr", "json", "c"]
+"""The names in `exports.FORMATS`, which itself would make every `--help` slow."""
 
 
 def export(

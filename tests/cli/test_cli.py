@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import ast
 import csv
 import io
 import json
+import re
 import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
+import fieldcal
 from fieldcal import schemas
+from fieldcal.cli.fly import Format
 from fieldcal.cli.main import run
+from fieldcal.exports import FORMATS
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 
@@ -74,6 +79,12 @@ def test_help_imports_nothing_heavy() -> None:
     )
     told = subprocess.run([sys.executable, "-c", program], cwd=REPOSITORY, capture_output=True, text=True)
     assert told.stdout == "[]\n"
+
+
+def test_every_export_can_be_chosen() -> None:
+    (documented,) = re.findall(r"to : \{(.*)\}", str(fieldcal.export.__doc__))
+    assert get_args(Format) == tuple(FORMATS)
+    assert ast.literal_eval(f"({documented})") == tuple(FORMATS)
 
 
 def test_calibrate_prints_the_tables_as_one_document(capsys: pytest.CaptureFixture[str], log: Path) -> None:
