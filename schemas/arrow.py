@@ -7,14 +7,17 @@ from collections.abc import Mapping
 import pyarrow as pa
 
 from fieldcal.schemas.column import AS_LOGGED
+from fieldcal.schemas.rows import may_be_null
 from fieldcal.schemas.tables import TABLES, table_columns, table_key
 
 TABLE_KEY = "fieldcal.table"
 VERSION_KEY = "fieldcal.schema_version"
 
+_MADE_ANEW = "Move this table's files away and run the night: they are made anew from the logs that the archive holds"
+
 
 class SchemaMismatch(ValueError):
-    """A schema is not that of its table: missing, additional or wrongly typed columns, or another version."""
+    """A schema is not that of its table: missing, additional or wrongly typed columns, or a version not to be read."""
 
 
 def arrow_schema(
@@ -53,29 +56,56 @@ def arrow_schema(
     return pa.schema(fields, metadata=dict(sorted(facts.items())))
 
 
-def check(schema: pa.Schema, table: str, *, stage: bool = False) -> None:
-    """Raise `SchemaMismatch` unless `schema` has exactly the columns, types and version of `table` (in any order)."""
-    wanted = {column.name: column.type for column in table_columns(table, stage=stage)}
-    found = {field.name: field.type for field in schema}
+def check(schema: pa.Schema, table: str, *, stage: bool = False) -> tuple[str, ...]:
+    """Columns that a file lacks because an older version wrote it, and that are null in all of its rows.
+
+    Raises
+    ------
+    SchemaMismatch
+        It has not exactly the columns, types and version of `table` (in any order); or an older version wrote it, and
+        it lacks a column that no row can do without, or has one in another type or unit.
+    """
+    wanted = {field.name: field for field in arrow_schema(table, stage=stage)}
+    found = {field.name: field for field in schema}
+    facts = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
+    known = TABLES[table].version
+    version = int(facts.get(VERSION_KEY, known))
+    older = version < known
+    absent = tuple(name for name in wanted if name not in found)
     differences = []
     if len(found) != len(schema):
         differences.append("a column name occurs twice")
-    if missing := [name for name in wanted if name not in found]:
+    if missing := [name for name in absent if not (older and name in _dispensable(table))]:
         differences.append(f"missing {', '.join(missing)}")
-    if extra := [name for name in found if name not in wanted]:
+    if (extra := [name for name in found if name not in wanted]) and not older:
         differences.append(f"not in the table: {', '.join(extra)}")
-    differences += [
-        f"{name} is {found[name]} instead of {kind}"
-        for name, kind in wanted.items()
-        if name in found and found[name] != kind
-    ]
-    facts = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
+    both = [(name, found[name], wanted[name]) for name in wanted if name in found]
+    differences += [f"{name} is {f.type} instead of {w.type}" for name, f, w in both if f.type != w.type]
+    if older:
+        units = [(name, _unit(f), _unit(w)) for name, f, w in both if _unit(w) != AS_LOGGED]
+        differences += [f"{name} is in {f} instead of {w}" for name, f, w in units if f != w]
     if TABLE_KEY in facts and facts[TABLE_KEY] != table:
         differences.append(f"it says it is the table {facts[TABLE_KEY]}")
-    if VERSION_KEY in facts and facts[VERSION_KEY] != str(TABLES[table].version):
-        differences.append(f"schema version {facts[VERSION_KEY]}, this release knows version {TABLES[table].version}")
-    if differences:
-        raise SchemaMismatch(f"this is not the table {table}: {'; '.join(differences)}")
+    if version > known or (older and differences):
+        differences.append(f"schema version {version}, this release knows version {known}")
+    if not differences:
+        return absent
+    remedy = ""
+    if version != known:
+        remedy = ". A newer fieldcal wrote it: install that" if version > known else f". {_MADE_ANEW}"
+    raise SchemaMismatch(f"this is not the table {table}: {'; '.join(differences)}{remedy}")
+
+
+def _dispensable(table: str) -> frozenset[str]:
+    """Columns that rows of an older version may lack. A stage's own tables are made anew with its code."""
+    definition = TABLES[table]
+    if definition.kind == "history":
+        return may_be_null(table)
+    return frozenset(definition.column_names) - {*definition.key} if definition.kind == "signal" else frozenset()
+
+
+def _unit(field: pa.Field) -> str:
+    return str((field.metadata or {}).get(b"unit", b"").decode())
 
 
 def conform(rows: pa.Table, table: str, schema: pa.Schema | None = None, *, stage: bool = False) -> pa.Table:

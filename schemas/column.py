@@ -38,7 +38,8 @@ class Column:
 class Table:
     """One table: its columns in order, the columns that identify a row, and its version.
 
-    The version grows whenever a column is added, removed or changes its type, unit or meaning.
+    The version grows whenever a column is added, removed or changes its type or unit; another meaning is another name.
+    What an older version wrote is read as long as no row needs what it lacks (`arrow.check`).
     """
 
     name: str

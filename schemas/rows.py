@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import datetime
-from typing import TypedDict
+from types import NoneType
+from typing import TypedDict, get_args, get_type_hints
 
 from fieldcal.names import Json
 
@@ -176,3 +177,18 @@ class FlightDocument(TypedDict):
     fit: list[FitRow]
     sync: SyncRow | None
     run: list[UnfoldedRun]
+
+
+ROWS = {
+    "flight": FlightRow,
+    "calibration": CalibrationRow,
+    "fit": FitRow,
+    "sync": SyncRow,
+    "run": RunRow,
+    "drift": DriftRow,
+}
+
+
+def may_be_null(table: str) -> frozenset[str]:
+    """Columns of a table of the history that a row may have no value in."""
+    return frozenset(name for name, hint in get_type_hints(ROWS[table]).items() if NoneType in get_args(hint))

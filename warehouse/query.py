@@ -12,7 +12,7 @@ import polars as pl
 from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES
 from fieldcal.warehouse.layout import encode_id, history_files, history_path, signal_files, signal_path
 from fieldcal.warehouse.signals import signal_ids
-from fieldcal.warehouse.store import empty_frame
+from fieldcal.warehouse.store import by_absent_columns, empty_frame
 
 if TYPE_CHECKING:
     from fieldcal.warehouse.sql import Limits, SqlValue
@@ -81,10 +81,13 @@ class Warehouse:
 
 
 def _scan(files: Sequence[Path], table: str) -> pl.LazyFrame:
-    if not files:
-        return empty_frame(table).lazy()
-    columns = list(TABLES[table].column_names)
-    return pl.scan_parquet(list(files), hive_partitioning=False, glob=False).select(columns)
+    """Rows of a table's files; null in a column that is younger than the file."""
+    columns, forms = TABLES[table].column_names, by_absent_columns(files, table)
+    parts = [
+        pl.scan_parquet(paths, hive_partitioning=False, glob=False).select(n for n in columns if n not in absent)
+        for absent, paths in forms.items()
+    ]
+    return parts[0] if list(forms) == [()] else pl.concat([empty_frame(table).lazy(), *parts], how="diagonal")
 
 
 def _with_ids(path: Path, table: str) -> pl.LazyFrame:

@@ -7,7 +7,7 @@ the configuration locked before the query is looked at.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import date, datetime
 from pathlib import Path
@@ -22,7 +22,7 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import HISTORY_TABLES
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.layout import history_files, vehicle_of
-from fieldcal.warehouse.store import frame
+from fieldcal.warehouse.store import by_absent_columns, frame
 from fieldcal.warehouse.view_text import view_text
 
 # In the order in which they are made: later ones may need earlier ones.
@@ -126,7 +126,13 @@ def _answer(
 
 
 def _table_view(table: str, paths: Sequence[Path]) -> str:
-    """A view over a table's files. Where folders tell the vehicles exactly, a query for one vehicle opens one file.
+    """A view over a table's files; null in a column that is younger than the file."""
+    forms = by_absent_columns(paths, table)
+    return f"CREATE VIEW {table} AS {' UNION ALL '.join(_select(table, own, absent) for absent, own in forms.items())}"
+
+
+def _select(table: str, paths: Sequence[Path], absent: Collection[str]) -> str:
+    """Rows of files of one form. Where folders tell the vehicles exactly, a query for one vehicle opens one file.
 
     Columns are qualified: inside a macro a bare name would be the macro's parameter.
     """
@@ -134,8 +140,15 @@ def _table_view(table: str, paths: Sequence[Path]) -> str:
     how = (
         "hive_partitioning = true, hive_types = {'vehicle_id': 'VARCHAR'}" if by_folder else "hive_partitioning = false"
     )
-    columns = ", ".join(f'f."{name}"' for name in schemas.TABLES[table].column_names)
-    return f"CREATE VIEW {table} AS SELECT {columns} FROM read_parquet({_listed(paths)}, {how}) AS f"
+    names = schemas.TABLES[table].column_names
+    columns = ", ".join(_null(table, name) if name in absent else f'f."{name}"' for name in names)
+    return f"SELECT {columns} FROM read_parquet({_listed(paths)}, {how}) AS f"
+
+
+def _null(table: str, name: str) -> str:
+    column = schemas.arrow_schema(table).field(name)
+    (kind,) = duckdb.from_arrow(pa.schema([column]).empty_table()).types
+    return f'CAST(NULL AS {kind}) AS "{name}"'
 
 
 def _listed(paths: Sequence[Path]) -> str:

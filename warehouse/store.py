@@ -7,7 +7,7 @@ both. Floats are dictionary-encoded, time stamps delta-encoded, pages compressed
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 from fieldcal import schemas
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import SchemaMismatch
+from fieldcal.schemas.arrow import VERSION_KEY
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import AroundRename, AtomicFile
 
@@ -152,7 +153,7 @@ def table_bytes(data: Data, table: str) -> bytes:
 
 
 def read_table(path: Path, table: str, *, stage: bool = False) -> pl.DataFrame:
-    """Read a table, verifying page checksums and schema.
+    """Read a table, verifying page checksums and schema. Columns that an older version did not have are null.
 
     Raises
     ------
@@ -170,10 +171,10 @@ def read_arrow(source: Path | bytes, table: str, *, stage: bool = False, name: s
             source = source.read_bytes()
     try:
         with pq.ParquetFile(pa.BufferReader(source), page_checksum_verification=True) as file:
-            schemas.check(file.schema_arrow, table, stage=stage)
-            rows = file.read(columns=list(_names(table, stage)))
+            absent = schemas.check(file.schema_arrow, table, stage=stage)
+            rows = file.read(columns=[name for name in _names(table, stage) if name not in absent])
             rows.validate(full=True)
-            return rows
+            return _with_nulls(rows, absent, table, stage)
     except SchemaMismatch as error:
         raise WarehouseError(ReasonCode.SCHEMA_MISMATCH, f"{shown}: {error}.") from error
     except (pa.ArrowException, OSError, ValueError) as error:
@@ -181,6 +182,29 @@ def read_arrow(source: Path | bytes, table: str, *, stage: bool = False, name: s
         raise WarehouseError(
             ReasonCode.DAMAGED_FILE, f"{shown} is damaged ({first_line}); `fieldcal verify` lists what else is."
         ) from error
+
+
+def by_absent_columns(paths: Iterable[Path], table: str) -> dict[tuple[str, ...], list[Path]]:
+    """Files of a table by the columns that they lack because an older version wrote them: none, as a rule.
+
+    Raises
+    ------
+    WarehouseError
+        `schema_mismatch`: one of another version that cannot be read as this one.
+    """
+    known = str(schemas.TABLES[table].version)
+    found: dict[tuple[str, ...], list[Path]] = {}
+    for path in paths:
+        absent: tuple[str, ...] = ()
+        try:
+            if pl.read_parquet_metadata(path).get(VERSION_KEY, known) != known:
+                absent = schemas.check(pq.read_schema(path), table)
+        except SchemaMismatch as error:
+            raise WarehouseError(ReasonCode.SCHEMA_MISMATCH, f"{path}: {error}.") from error
+        except (pl.exceptions.PolarsError, pa.ArrowException, OSError, ValueError):
+            pass  # damaged: whoever reads its rows says so
+        found.setdefault(absent, []).append(path)
+    return found
 
 
 def read_facts(path: Path) -> dict[str, str]:
@@ -216,6 +240,14 @@ def _arrow(data: Data) -> pa.Table:
     if isinstance(data, pa.Table):
         return data
     return pa.table({name: pa.array(np.ascontiguousarray(column)) for name, column in data.items()})
+
+
+def _with_nulls(rows: pa.Table, absent: Collection[str], table: str, stage: bool) -> pa.Table:
+    """The rows with the columns that they lack, in the table's order."""
+    schema = schemas.arrow_schema(table, stage=stage)
+    for name in absent:
+        rows = rows.append_column(schema.field(name), pa.nulls(rows.num_rows, schema.field(name).type))
+    return rows.select(schema.names)
 
 
 def _names(table: str, stage: bool) -> tuple[str, ...]:

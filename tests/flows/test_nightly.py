@@ -15,15 +15,18 @@ from typing import Any
 
 import polars as pl
 import pytest
+from older_history import age
 
 from fieldcal.batch.outcome import Outcome
 from fieldcal.batch.steps import STEPS
+from fieldcal.cli.main import run
 from fieldcal.flows.run import dry_run, run_night
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.stages.pipeline import PIPELINE
-from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.content import content_sha256
+from fieldcal.warehouse.layout import history_files
 from fieldcal.warehouse.verify import verify
 
 REPOSITORY = Path(__file__).parents[2]
@@ -106,6 +109,49 @@ def test_an_unchanged_night_runs_nothing_and_changes_no_byte(simulated: Path, wa
     result = run_night(simulated, warehouse, None, None, 1)
     assert (result["stages_run"], result["stages_cached"], result["ok"]) == (0, 2 * len(STEPS), 2)
     assert {part: file_hashes(warehouse / part) for part in before} == before
+
+
+def test_a_history_of_an_older_release_is_shown_and_brought_up_to_date(simulated: Path, warehouse: Path) -> None:
+    before = content_sha256(warehouse), file_hashes(warehouse / "tables")
+    young = {
+        "flight": ["verifiable", "n_samples", "findings"],
+        "calibration": ["temperature_degc"],
+        "fit": ["tic_bias"],
+        "sync": ["runner_up"],
+        "run": ["versions"],
+        "drift": ["best_known_at"],
+    }
+    for table, columns in young.items():
+        for path in history_files(warehouse, table):
+            age(warehouse, path, table, columns)
+    assert content_sha256(warehouse) != before[0]
+    flight_id = Warehouse(warehouse).scan("flight").collect()["flight_id"][0]
+    for command in (
+        "history",
+        "drift",
+        "report",
+        "report --vehicle sim-1",
+        f"report --flight {flight_id}",
+        "export sim-1",
+    ):
+        assert run([*command.split(), "--warehouse", str(warehouse)]) == 0, command
+    result = run_night(simulated, warehouse, None, None, 1)
+    assert (result["stages_run"], result["ok"]) == (0, 2)
+    assert (content_sha256(warehouse), file_hashes(warehouse / "tables")) == before
+
+
+def test_a_night_on_a_history_that_it_cannot_read_says_what_to_do(simulated: Path, warehouse: Path) -> None:
+    content = content_sha256(warehouse)
+    paths = history_files(warehouse, "flight")
+    age(warehouse, paths[0], "flight", ["verdict"])
+    with pytest.raises(WarehouseError, match="Move this table's files away and run the night") as caught:
+        run_night(simulated, warehouse, None, None, 1)
+    assert caught.value.reason_code == "schema_mismatch"
+    for path in paths:
+        path.unlink()
+    run_night(simulated, warehouse, None, None, 1)
+    assert content_sha256(warehouse) == content
+    assert verify(warehouse)["ok"]
 
 
 def test_a_changed_cut_off_runs_smoothing_and_what_reads_from_it(archive: Path, warehouse: Path) -> None:

@@ -9,16 +9,8 @@ from typing import Any, get_args, get_type_hints
 import pyarrow as pa
 import pytest
 
-from fieldcal.schemas import rows, table_columns, table_key
+from fieldcal.schemas import HISTORY_TABLES, rows, table_columns, table_key
 
-ROWS = {
-    "flight": rows.FlightRow,
-    "calibration": rows.CalibrationRow,
-    "fit": rows.FitRow,
-    "sync": rows.SyncRow,
-    "run": rows.RunRow,
-    "drift": rows.DriftRow,
-}
 TYPES = {
     pa.string(): str,
     pa.float64(): float,
@@ -28,20 +20,25 @@ TYPES = {
 }
 
 
-@pytest.mark.parametrize("table", ROWS)
+def test_every_table_of_the_history_has_its_row() -> None:
+    assert tuple(rows.ROWS) == HISTORY_TABLES
+
+
+@pytest.mark.parametrize("table", rows.ROWS)
 def test_a_row_has_the_columns_and_types_of_its_table(table: str) -> None:
-    hints = get_type_hints(ROWS[table])
+    hints = get_type_hints(rows.ROWS[table])
     found = {name: next(t for t in get_args(hint) or (hint,) if t is not NoneType) for name, hint in hints.items()}
     assert found == {column.name: TYPES[column.type] for column in table_columns(table)}
-    assert ROWS[table].__optional_keys__ == frozenset()
+    assert rows.ROWS[table].__optional_keys__ == frozenset()
 
 
-@pytest.mark.parametrize("table", ROWS)
+@pytest.mark.parametrize("table", rows.ROWS)
 def test_none_stands_where_a_column_may_be_null_and_nowhere_in_a_key(table: str) -> None:
-    hints: dict[str, Any] = get_type_hints(ROWS[table])
+    hints: dict[str, Any] = get_type_hints(rows.ROWS[table])
     optional = {name for name, hint in hints.items() if NoneType in get_args(hint)}
     assert {column.name for column in table_columns(table) if "null" in column.meaning} <= optional
     assert not optional & set(table_key(table))
+    assert rows.may_be_null(table) == optional
 
 
 @pytest.mark.parametrize(

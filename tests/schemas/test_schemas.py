@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import subprocess
 import sys
 
@@ -113,6 +114,52 @@ def test_check_names_every_difference() -> None:
         schemas.check(imu.with_metadata({"fieldcal.schema_version": "99"}), "imu")
     with pytest.raises(schemas.SchemaMismatch, match="twice"):
         schemas.check(pa.schema([*imu, imu.field(1)]), "imu")
+
+
+def test_check_tells_what_an_older_file_lacks_and_a_row_can_do_without() -> None:
+    drift = schemas.arrow_schema("drift")
+    older = drift.with_metadata({"fieldcal.table": "drift", "fieldcal.schema_version": "2"})
+    assert schemas.check(drift, "drift") == schemas.check(older, "drift") == ()
+    lacking = older.remove(older.get_field_index("borrowed_from")).append(pa.field("former", pa.int8()))
+    assert schemas.check(lacking, "drift") == ("borrowed_from",)
+    with pytest.raises(schemas.SchemaMismatch, match=r"missing n_flights.*version 2, this release knows version 3"):
+        schemas.check(lacking.remove(lacking.get_field_index("n_flights")), "drift")
+    segments = schemas.arrow_schema("segments").with_metadata({"fieldcal.schema_version": "0"})
+    with pytest.raises(schemas.SchemaMismatch, match="missing reason"):
+        schemas.check(segments.remove(segments.get_field_index("reason")), "segments")
+
+
+FORMS = {
+    "imu": (1, "6b0ed5f0"),
+    "magnetometer": (1, "a8d88f02"),
+    "temperature": (1, "d66d7a93"),
+    "vps": (1, "a8342131"),
+    "position": (1, "af486156"),
+    "power": (1, "8f471e07"),
+    "faults": (1, "a52b66de"),
+    "segments": (1, "00bc3bfc"),
+    "samples": (1, "ff1cc6e0"),
+    "attitude": (1, "a7562912"),
+    "trajectory": (1, "9dcde4d1"),
+    "held_out": (1, "b3e93959"),
+    "covariance": (1, "95bf049d"),
+    "vps_aligned": (1, "8f8b1e84"),
+    "flight": (1, "e2a4d5fc"),
+    "calibration": (1, "44f85a5f"),
+    "fit": (1, "1da89ccb"),
+    "sync": (1, "5d5d4459"),
+    "run": (1, "4c6f4dd1"),
+    "drift": (3, "20966f86"),
+}
+"""Version of every table and digest of its columns: only by its version is an older file known for one."""
+
+
+def test_a_table_of_other_columns_has_another_version() -> None:
+    def form(table: str) -> str:
+        columns = [(c.name, str(c.type), c.unit) for c in schemas.table_columns(table)]
+        return hashlib.sha256(repr(columns).encode()).hexdigest()[:8]
+
+    assert {name: (table.version, form(name)) for name, table in schemas.TABLES.items()} == FORMS
 
 
 def test_data_dictionary_lists_every_column() -> None:
