@@ -39,8 +39,9 @@ import signal
 import sys
 import tempfile
 import threading
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import CodeType, FrameType, FunctionType
@@ -203,13 +204,18 @@ def names_around(node: ast.AST, where: str = "") -> Iterator[tuple[int, str]]:
 
 
 def changes_of(module: str) -> list[Change]:
-    """Every change of a module."""
-    found = []
+    """Every change of a module. The second place of a line at which the same is changed is marked `#2`, and so on."""
+    found: list[Change] = []
+    alike: defaultdict[tuple[int, str], list[tuple[int, int]]] = defaultdict(list)
     tree = ast.parse(source_of(module).read_text())
     around = dict(names_around(tree))
     for number, (node, at_import, what, _) in enumerate(places(tree)):
         end = node.end_lineno or node.lineno
         found.append(Change(module, number, around[id(node)], node.lineno, end, at_import, what))
+        alike[node.lineno, what].append((node.col_offset, len(found) - 1))
+    for places_on_line in alike.values():
+        for n, (_, i) in enumerate(sorted(places_on_line)[1:], 2):
+            found[i] = replace(found[i], what=f"{found[i].what} #{n}")
     return sorted(found, key=lambda change: change.line)
 
 

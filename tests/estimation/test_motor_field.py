@@ -137,6 +137,22 @@ def result_of(share: float, p_value: float) -> MotorField:
     return MotorField(SLOPE_UT_PER_A, SLOPE_UT_PER_A / 10, 24.0, share, 0.001, 0.8, 400.0, p_value)
 
 
+def exact(n: int, k: np.ndarray) -> MotorField | None:
+    """Readings of a field of length 1 to which a drive between −½ and ½ adds k per unit."""
+    rng = np.random.default_rng(9)
+    e = rng.normal(size=(n, 3))
+    drive = rng.permutation(np.linspace(-0.5, 0.5, n))
+    return motor_field(e / np.linalg.norm(e, axis=1, keepdims=True) + drive[:, None] * k, drive, 1.0)
+
+
+def test_a_hundred_samples_are_the_fewest() -> None:
+    assert exact(99, np.array([0.1, 0.0, 0.0])) is None
+    result = exact(100, np.array([0.1, 0.0, 0.0]))
+    assert result is not None
+    assert result.slope == pytest.approx([0.1, 0.0, 0.0], abs=1e-6)
+    assert result.span == pytest.approx(0.98)
+
+
 def test_limits_and_sentence() -> None:
     assert motor_fault(result_of(0.5, 2 * SIGNIFICANT_P), "current", "A", "uT") is None
     assert motor_fault(result_of(REPORTED_SHARE, 0.0), "current", "A", "uT") is None

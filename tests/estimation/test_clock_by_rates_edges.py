@@ -257,3 +257,17 @@ def test_stamps_on_either_clock() -> None:
     assert fit.lag_s == pytest.approx(t[0] - vps[0])
     assert fit.lag_sd_s == pytest.approx(2e-3)
     assert fit.skew_sd_ppm == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("rate_hz", [185.0, 2000.0])
+def test_the_grid_is_the_imus_but_no_finer_than_a_millisecond(rate_hz: float) -> None:
+    """Told by the width of the peak, a whole number of steps; what the fit is about, by the IMU's stamps."""
+    t, rate, stamps, q = record(12.0)
+    own = 4.0 + np.arange(0.0, 12.0, 1.0 / rate_hz)
+    fit = by_rates.synchronise(own, np.stack([np.interp(own - 4.0, t, c) for c in rate.T], axis=1), stamps, q)
+    steps = fit.peak_width_s / max(1.0 / rate_hz, 1e-3)
+    assert steps == pytest.approx(round(steps), abs=1e-6)
+    assert steps > 10
+    assert fit.first_s == own[0]
+    assert fit.reference_s == pytest.approx(0.5 * (own[0] + own[-1]), rel=1e-12)
+    assert fit.lag_s == pytest.approx(4.0, abs=2e-3)
