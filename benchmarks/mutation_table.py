@@ -355,7 +355,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "estimation.clock_sync.by_rates",
         "_refine",
         "if abs(step[0]) < 1e-9 and abs(step[1]) < 1e-10:",
-        "1e-10 → 1.1e-10",
+        "1e-10 → 1.1000000000000001e-10",
     ): _CONVERGED,
     (
         "estimation.clock_sync.by_rates",
