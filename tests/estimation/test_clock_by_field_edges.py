@@ -96,6 +96,19 @@ def test_two_hundred_readings_are_enough(known: Known, readings: int, enough: bo
     assert (refine_by_field(t, own, t_vps, q, fit)[1] is not None) == enough
 
 
+def test_readings_in_a_gap_are_none_of_the_two_hundred(known: Known) -> None:
+    t, logged, t_vps, q, fit, _, _ = known
+    kept = (t_vps < t_vps[0] + 8.0) | (t_vps > t_vps[0] + 9.0)
+    at = t - fit.lag_mid_s
+    gap = (at > t_vps[0] + 8.05) & (at < t_vps[0] + 8.95)
+    own = logged.copy()
+    outside = np.flatnonzero((at < t_vps[0] + 7.9) & (at > t_vps[0] + 1.0))
+    own[np.setdiff1d(np.arange(len(t)), [*np.flatnonzero(gap), *outside[:: len(outside) // 150][:150]])] = np.nan
+    assert gap.sum() > 100
+    assert refine_by_field(t, own, t_vps, q, fit)[1] is not None
+    assert refine_by_field(t, own, t_vps[kept], q[kept], fit)[1] is None
+
+
 def test_readings_outside_the_vps_or_in_its_gaps_do_not_count(known: Known) -> None:
     t, logged, t_vps, q, fit, _, own = known
     spoiled = logged.copy()

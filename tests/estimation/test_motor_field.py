@@ -153,6 +153,37 @@ def test_a_hundred_samples_are_the_fewest() -> None:
     assert result.span == pytest.approx(0.98)
 
 
+@pytest.mark.parametrize(
+    ("share", "share_sd", "p_value", "limit"),
+    [
+        (0.02, 0.001, 1e-9, None),
+        (0.0201, 0.001, 1e-9, 0.02),
+        (0.0201, 0.001, 1e-4, 0.02),
+        (0.0201, 0.001, 1.05e-4, None),
+        (0.125, 0.0125, 1e-9, 0.02),
+        (0.125, 0.0124, 1e-9, 0.10),
+    ],
+)
+def test_two_per_cent_are_told_and_ten_refuse_where_they_are_sure(
+    share: float, share_sd: float, p_value: float, limit: float | None
+) -> None:
+    """One in ten thousand by chance; two standard deviations beyond the limit."""
+    fault = motor_fault(
+        MotorField(np.array([0.1, -0.25, 0.0]), np.ones(3), 7.0, share, share_sd, 0.5, 40.0, p_value),
+        "current",
+        "A",
+        "uT",
+    )
+    if limit is None:
+        assert fault is None
+        return
+    assert fault is not None
+    assert (fault.limit, fault.fatal, fault.value) == (limit, limit == 0.10, share)
+    said = f"by {100 * share:.1f} % of the local field (sd {100 * share_sd:.1f} %) over its range of 7 A"
+    assert said in fault.sentence
+    assert "(0.1, -0.25, 0) uT per A along x, y, z (correlation 0.50, 40 independent samples)" in fault.sentence
+
+
 def test_limits_and_sentence() -> None:
     assert motor_fault(result_of(0.5, 2 * SIGNIFICANT_P), "current", "A", "uT") is None
     assert motor_fault(result_of(REPORTED_SHARE, 0.0), "current", "A", "uT") is None

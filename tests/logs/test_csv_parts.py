@@ -247,7 +247,7 @@ def rows(
 
 
 def test_what_is_a_row_and_what_is_counted_as_lost() -> None:
-    text = "1,2,3\n\n# c\n4,5,6,\n7,8\n9,10,11,12\na,b,c\n \t\n13,14,\n,,\n1\0,2,3\n15,16,17,x,\n1,2,3,,\n"
+    text = "1,2,3\n\n# c\n4,5,6,\n7,8\n9,10,11,12\na,b,c\n\t \n13,14,\n,,\n1\0,2,3\n15,16,17,x,\n1,2,3,,\n"
     cells, numbers, losses = rows(text)
     assert cells == [("1", "3"), ("4", "6"), ("13", None), (None, None)]
     assert numbers == [11, 14, 19, 20]
