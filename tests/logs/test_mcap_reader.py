@@ -295,5 +295,8 @@ def test_json_messages_nest_by_their_paths(tmp_path: Path, flight: Flight) -> No
     q, p, t = flight.quaternion[0], flight.position[0], int(flight.t_ns[0]) + 7
     assert pose == {
         "header": {"frame_id": "world", "stamp": {"sec": t // 10**9, "nanosec": t % 10**9}},
-        "pose": {"orientation": dict(zip("xyzw", q.tolist(), strict=True)), "position": dict(zip("xyz", p.tolist(), strict=True))},
-    }  # fmt: skip
+        "pose": {
+            "orientation": dict(zip("xyzw", q.tolist(), strict=True)),
+            "position": dict(zip("xyz", p.tolist(), strict=True)),
+        },
+    }
