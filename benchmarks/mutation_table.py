@@ -59,6 +59,7 @@ _NEVER_MET = "real numbers do not meet there"
 _CONVERGED = "Gauss and Newton converge quadratically: a step more or less moves nothing that is seen"
 _ALGORITHM = "another algorithm for the same inverse"
 _RCOND = "rounding and what is seen lie orders apart on either side"
+_ROUNDS = "another round of reweighting moves a small part of the standard deviation"
 
 EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     (
@@ -635,5 +636,63 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("logs.mcap.file", "", "LOOSE_BYTES = 4 << 20", "4 → 5"): _AT_A_TIME,
     ("logs.mcap.file", "", "MESSAGES_AT_ONCE = 1 << 16", "16 → 17"): _AT_A_TIME,
     ("logs.mcap.file", "", "MESSAGES_AT_ONCE = 1 << 16", "1 → 2"): _AT_A_TIME,
+    (
+        "estimation.clock_sync.by_rates",
+        "mask_outliers",
+        "fast = step > max_rate * np.maximum(np.diff(t[i]), 1e-4) + 2e-3",
+        "> → >=",
+    ): _NEVER_MET,
+    (
+        "estimation.clock_sync.by_rates",
+        "",
+        "REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock",
+        "3 → 4",
+    ): _ROUNDS,
+    (
+        "estimation.clock_sync.by_field",
+        "",
+        "REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock",
+        "3 → 4",
+    ): _ROUNDS,
+    ("estimation.gyroscope.equation_error", "", "ROBUST_ROUNDS = 6", "6 → 7"): _ROUNDS,
+    ("estimation.warm_up", "", "ITERATIONS = 20", "20 → 22"): _ROUNDS,
+    (
+        "estimation.warm_up",
+        "fit_resting_accelerometer",
+        "if len(middles) < LEAST_WINDOWS or span < LEAST_SPAN_DEGC:",
+        "< → <= #2",
+    ): _NEVER_MET,
+    ("estimation.warm_up", "fit_warm_up", "if span < LEAST_SPAN_DEGC:", "< → <="): _NEVER_MET,
+    (
+        "logs.stamps",
+        "Unwrapper.__call__",
+        "forward = inside & (step < 0) & (step + period <= WRAP_PAUSE_NS)",
+        "< → <=",
+    ): "a step of 0 is a whole period from the next wrap",
+    (
+        "logs.stamps",
+        "Unwrapper.__call__",
+        "back = inside & (step > 0) & (period - step <= WRAP_PAUSE_NS) & bool(self.wraps or forward.any())",
+        "> → >=",
+    ): "a step of 0 is a whole period from the next wrap",
+    (
+        "estimation.faults",
+        "_dead",
+        'sentence = f"The {sensor}\'s {axis} reads {x[0]:.6g} {unit} in all {len(x)} samples: it is dead or not connected."',
+        "0 → 1",
+    ): "all readings are the same",
+    ("logs.mcap.file", "", "RELEASE_BYTES = 64 << 20", "<< → >>"): _AT_A_TIME,
+    (
+        "logs.mcap.file",
+        "McapFile._chunk",
+        "self._lost_chunk, self._unsure = False, -1",
+        "1 → 2",
+    ): "anything below 0 says that there is none",
+    (
+        "logs.mcap.file",
+        "McapFile._loose",
+        "self._lost_chunk, self._unsure = False, -1",
+        "1 → 2",
+    ): "anything below 0 says that there is none",
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

@@ -378,9 +378,10 @@ def test_a_vps_without_its_position_is_kept(tmp_path: Path) -> None:
 
 def test_a_time_of_iso_8601_is_told_by_the_first_row(tmp_path: Path) -> None:
     text = "t,gx,gy,gz\n\n# pause\n2024-05-01T12:00:00Z,1,2,3\n"
-    frames, summary = read(tmp_path, text)
-    assert frames["imu"]["t_ns"].to_list() == [1714564800 * 10**9]
-    assert summary.epoch_known
+    for comments in ("", 60 * "# made by hand\n"):
+        frames, summary = read(tmp_path, comments + text)
+        assert frames["imu"]["t_ns"].to_list() == [1714564800 * 10**9]
+        assert summary.epoch_known
     frames, summary = read(tmp_path, "t,gx,gy,gz\n5,1,2,3\n2024-05-01T12:00:00Z,1,2,3\n")
     assert frames["imu"]["t_ns"].to_list() == [5 * 10**9]
     assert not summary.epoch_known

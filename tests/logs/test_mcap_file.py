@@ -37,6 +37,35 @@ def record(opcode: int, body: bytes) -> bytes:
     return struct.pack("<BQ", opcode, len(body)) + body
 
 
+@pytest.mark.parametrize("garbage", [b"\x77", b"\x77\x77"])
+def test_a_chunk_right_behind_a_byte_too_many_is_found(tmp_path: Path, garbage: bytes) -> None:
+    content = Flight(400).write(tmp_path / "a.mcap", chunk_size=30_000).read_bytes()
+    begins: list[int] = []
+    position = len(MAGIC)
+    while len(begins) < 3:
+        begins += [position] if content[position] == 6 else []
+        position += 9 + int.from_bytes(content[position + 1 : position + 9], "little")
+    (tmp_path / "b.mcap").write_bytes(content[: begins[2]] + garbage + content[begins[2] :])
+    file = McapFile(tmp_path / "b.mcap")
+    assert sum(len(block.starts) for block in file.blocks()) == 1600
+    assert [place for place, _ in file.tally.damaged_records] == [begins[2]]
+
+
+def chunk_declaring(size: int) -> bytes:
+    """A chunk of a hundred bytes that unpack to nothing, of whatever size it says."""
+    head = struct.pack("<QQQI", size, size, size, 0) + struct.pack("<I", 4) + b"zstd"
+    return record(6, head + struct.pack("<Q", 100) + bytes(100))
+
+
+def test_half_a_gibibyte_is_what_chunks_that_grow_too_much_may_cost_together(tmp_path: Path) -> None:
+    sizes = [256 << 20, 256 << 20, 1 << 20]
+    (tmp_path / "a.mcap").write_bytes(MAGIC + b"".join(map(chunk_declaring, sizes)) + record(15, bytes(4)))
+    file = McapFile(tmp_path / "a.mcap")
+    assert list(file.blocks()) == []
+    refused = [why.startswith("unpacking over 536870912 bytes") for _, why in file.tally.damaged_chunks]
+    assert refused == [False, False, True]
+
+
 def chunk_that_grows(times: float) -> bytes:
     """A chunk with one message of 100 kB that unpacks to so many times its size, or a little less."""
     rng = np.random.default_rng(0)

@@ -197,10 +197,12 @@ def test_a_known_type_that_cannot_be_read_is_one_finding(tmp_path: Path, flight:
         own = writer.register_channel("/imu", "cdr", good)
         writer.register_channel("/odd", "cdr", odd)
         writer.register_channel("/bson", "bson", odd)
+        writer.register_channel("/proto", "protobuf", odd)
         writer.add_message(own, 5, encode_cdr(imu)[0].tobytes(), 5)
         writer.finish()
     _, found, summary = told(tmp_path / "a.mcap")
-    assert found == [("unsupported_schema", 1, False), ("unsupported_schema", 1, False)]
+    assert found == [("unsupported_schema", 1, False)] * 3
+    assert "message encoding 'protobuf' with schema encoding 'ros2msg'" in summary.findings[2].sentence
     assert "message encoding 'bson' with schema encoding 'ros2msg'" in summary.findings[0].sentence
 
 
