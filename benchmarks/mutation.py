@@ -6,11 +6,10 @@
     python benchmarks/mutation.py --module exports --sample 40    # a room
 
 Needs the `test` extra and a system with fork. Nothing is written to the checkout: the changed module lives in the
-memory of a forked process. First a module's own tests (`TESTS` in
-`mutation_table.py`) run unchanged, and it is noted which of them pass
-through which line; a change is then shown to the tests of its line, the quickest first, until one fails. Tests are
-collected once a module, and functions get the changed code in a copy of that process: a fraction of a second a change.
-What runs at import (constants, defaults) is imported anew: some seconds.
+memory of a forked process. First a module's own tests (`TESTS` in `mutation_table.py`) run unchanged, and it is noted
+which of them pass through which line; a change is then shown to the tests of its line, the quickest first, until one
+fails. Tests are collected once a module, and functions get the changed code in a copy of that process: a fraction of a
+second a change. What runs at import (constants, defaults) is imported anew: some seconds.
 
 A *survivor* is a change that no test noticed. Either the tests miss something: write one that kills it, against a truth
 that does not come from the module (a closed form, another library, the simulator), never against yesterday's output. Or
@@ -39,8 +38,9 @@ import signal
 import sys
 import tempfile
 import threading
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import CodeType, FrameType, FunctionType
@@ -203,13 +203,18 @@ def names_around(node: ast.AST, where: str = "") -> Iterator[tuple[int, str]]:
 
 
 def changes_of(module: str) -> list[Change]:
-    """Every change of a module."""
-    found = []
+    """Every change of a module. The second place of a line at which the same is changed is marked `#2`, and so on."""
+    found: list[Change] = []
+    alike: defaultdict[tuple[int, str], list[tuple[int, int]]] = defaultdict(list)
     tree = ast.parse(source_of(module).read_text())
     around = dict(names_around(tree))
     for number, (node, at_import, what, _) in enumerate(places(tree)):
         end = node.end_lineno or node.lineno
         found.append(Change(module, number, around[id(node)], node.lineno, end, at_import, what))
+        alike[node.lineno, what].append((node.col_offset, len(found) - 1))
+    for places_on_line in alike.values():
+        for n, (_, i) in enumerate(sorted(places_on_line)[1:], 2):
+            found[i] = replace(found[i], what=f"{found[i].what} #{n}")
     return sorted(found, key=lambda change: change.line)
 
 

@@ -35,8 +35,8 @@ def attitudes(
     Parameters
     ----------
     observed : (n, k, 3) array
-        Vectors in body axes; lengths are ignored. For `triad` the first is trusted, for `euler` k is 2:
-        magnetic field, then gravity.
+        Vectors in body axes; lengths are ignored. For `triad` the heavier of the first two is exact; for `euler` k is
+        2: magnetic field, then gravity.
     reference : (k, 3) array
         The same vectors in n, non-collinear.
     sigma : (k,) array

@@ -100,6 +100,23 @@ def test_robust_weights_are_for_records_with_outliers(share: float, weighted: bo
     assert (found.share_used < 1.0) == weighted
 
 
+def test_clipped_readings_take_their_information_from_the_covariance() -> None:
+    """Weighted distances and their gradient, by `statistics`, and Huber's inflation on top."""
+    rng = np.random.default_rng(9)
+    x = directions(rng, 500) + 0.01 * rng.normal(size=(500, 3))
+    weight = rng.uniform(0.2, 1.5, 500).clip(max=1.0)
+    found = ellipsoid._with_statistics(x, np.eye(3), np.zeros(3), weight, 4)
+    length = np.linalg.norm(x, axis=1, keepdims=True)
+    u, root = x / length, np.sqrt(weight)[:, None]
+    gradient = np.hstack([u * u, u]) * root  # at the foot of each reading on the unit sphere
+    white, coloured = least_squares_covariance(gradient[:, None, :], (length - 1.0) * root)
+    inflation = (weight.mean() / np.mean(weight >= 1.0)) ** 2
+    assert inflation > 1.5
+    np.testing.assert_allclose(found.covariance, coloured * inflation, rtol=1e-6)
+    np.testing.assert_allclose(found.covariance_white, white, rtol=1e-6)
+    assert (found.share_used, found.iterations) == (weight.mean(), 4)
+
+
 def test_ten_readings_are_enough_and_no_motion_is_none() -> None:
     z = logged(directions(np.random.default_rng(5), 10))
     found = fit_ellipsoid(z, LENGTH, method="li", polarity=POLARITY)

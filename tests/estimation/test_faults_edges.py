@@ -298,3 +298,11 @@ def test_windows_are_five_seconds_long() -> None:
     five more of the others."""
     quick = 80.0 / (31 + 30 * 1.4)
     assert sampling_faults("gyroscope", stamps(*([quick] * 31 + [1.4 * quick] * 30) * 8)) == []
+
+
+def test_two_windows_are_enough_for_a_rate_to_change() -> None:
+    """Five seconds of each rate; a single window has nothing to differ from."""
+    slow, fast = np.arange(0.0, 5.0, 0.0625), 5.0 + np.arange(0.0, 5.0, 0.03125)
+    found = sampling_faults("gyroscope", np.r_[slow, fast])
+    assert [f.value for f in found if f.code == "rate_changes"] == [pytest.approx(2.0)]
+    assert sampling_faults("gyroscope", slow) == []

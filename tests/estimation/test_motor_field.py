@@ -137,6 +137,53 @@ def result_of(share: float, p_value: float) -> MotorField:
     return MotorField(SLOPE_UT_PER_A, SLOPE_UT_PER_A / 10, 24.0, share, 0.001, 0.8, 400.0, p_value)
 
 
+def exact(n: int, k: np.ndarray) -> MotorField | None:
+    """Readings of a field of length 1 to which a drive between −½ and ½ adds k per unit."""
+    rng = np.random.default_rng(9)
+    e = rng.normal(size=(n, 3))
+    drive = rng.permutation(np.linspace(-0.5, 0.5, n))
+    return motor_field(e / np.linalg.norm(e, axis=1, keepdims=True) + drive[:, None] * k, drive, 1.0)
+
+
+def test_a_hundred_samples_are_the_fewest() -> None:
+    assert exact(99, np.array([0.1, 0.0, 0.0])) is None
+    result = exact(100, np.array([0.1, 0.0, 0.0]))
+    assert result is not None
+    assert result.slope == pytest.approx([0.1, 0.0, 0.0], abs=1e-6)
+    assert result.span == pytest.approx(0.98)
+
+
+@pytest.mark.parametrize(
+    ("share", "share_sd", "p_value", "limit"),
+    [
+        (0.02, 0.001, 1e-9, None),
+        (0.0201, 0.001, 1e-9, 0.02),
+        (0.0201, 0.001, 1e-4, 0.02),
+        (0.0201, 0.001, 1.05e-4, None),
+        (0.125, 0.0125, 1e-9, 0.02),
+        (0.125, 0.0124, 1e-9, 0.10),
+    ],
+)
+def test_two_per_cent_are_told_and_ten_refuse_where_they_are_sure(
+    share: float, share_sd: float, p_value: float, limit: float | None
+) -> None:
+    """One in ten thousand by chance; two standard deviations beyond the limit."""
+    fault = motor_fault(
+        MotorField(np.array([0.1, -0.25, 0.0]), np.ones(3), 7.0, share, share_sd, 0.5, 40.0, p_value),
+        "current",
+        "A",
+        "uT",
+    )
+    if limit is None:
+        assert fault is None
+        return
+    assert fault is not None
+    assert (fault.limit, fault.fatal, fault.value) == (limit, limit == 0.10, share)
+    said = f"by {100 * share:.1f} % of the local field (sd {100 * share_sd:.1f} %) over its range of 7 A"
+    assert said in fault.sentence
+    assert "(0.1, -0.25, 0) uT per A along x, y, z (correlation 0.50, 40 independent samples)" in fault.sentence
+
+
 def test_limits_and_sentence() -> None:
     assert motor_fault(result_of(0.5, 2 * SIGNIFICANT_P), "current", "A", "uT") is None
     assert motor_fault(result_of(REPORTED_SHARE, 0.0), "current", "A", "uT") is None

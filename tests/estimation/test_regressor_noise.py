@@ -55,6 +55,27 @@ def test_nothing_is_taken_for_noise_where_it_cannot_be_told(rate_hz: float, cuto
     assert (found == 0.0).all()
 
 
+@pytest.mark.parametrize(("rate_hz", "told"), [(44.0, False), (46.0, True), (60.0, True)])
+def test_three_bins_below_four_fifths_of_nyquist_are_enough(rate_hz: float, told: bool) -> None:
+    """From 16 Hz on: 16 and 17 Hz lie below 17.6 Hz, 18 Hz as well below 18.4 Hz."""
+    n = int(40 * rate_hz)
+    found = smoothed_noise_variance(np.arange(n) / rate_hz, noise(n), np.zeros(n), CUTOFF_HZ)
+    assert (found > 0.0).all() == told
+    assert (found == 0.0).all() != told
+
+
+def test_stretches_shorter_than_a_block_are_left_out() -> None:
+    t = np.arange(8_000) * INTERVAL_S
+    x, label = noise(len(t)), np.zeros(8_000)
+    label[4_000:4_199], label[4_199:] = 1, 2
+    x[4_000:4_199] *= 1e3
+    plain = smoothed_noise_variance(t, noise(len(t)), np.zeros(8_000), CUTOFF_HZ)
+    np.testing.assert_allclose(smoothed_noise_variance(t, x, label, CUTOFF_HZ), plain, rtol=0.1)
+    label[4_199] = 1  # one sample more is a block, of forty
+    x[4_199] *= 1e3
+    assert (smoothed_noise_variance(t, x, label, CUTOFF_HZ) > 1e3 * plain).all()
+
+
 @pytest.mark.parametrize("scalar", [False, True])
 def test_what_uncertain_vectors_do_to_equation_error(scalar: bool) -> None:
     """First order against attitudes turned by the constants' errors and fitted again."""

@@ -247,7 +247,7 @@ def rows(
 
 
 def test_what_is_a_row_and_what_is_counted_as_lost() -> None:
-    text = "1,2,3\n\n# c\n4,5,6,\n7,8\n9,10,11,12\na,b,c\n \t\n13,14,\n,,\n1\0,2,3\n15,16,17,x,\n1,2,3,,\n"
+    text = "1,2,3\n\n# c\n4,5,6,\n7,8\n9,10,11,12\na,b,c\n\t \n13,14,\n,,\n1\0,2,3\n15,16,17,x,\n1,2,3,,\n"
     cells, numbers, losses = rows(text)
     assert cells == [("1", "3"), ("4", "6"), ("13", None), (None, None)]
     assert numbers == [11, 14, 19, 20]
@@ -378,9 +378,10 @@ def test_a_vps_without_its_position_is_kept(tmp_path: Path) -> None:
 
 def test_a_time_of_iso_8601_is_told_by_the_first_row(tmp_path: Path) -> None:
     text = "t,gx,gy,gz\n\n# pause\n2024-05-01T12:00:00Z,1,2,3\n"
-    frames, summary = read(tmp_path, text)
-    assert frames["imu"]["t_ns"].to_list() == [1714564800 * 10**9]
-    assert summary.epoch_known
+    for comments in ("", 60 * "# made by hand\n"):
+        frames, summary = read(tmp_path, comments + text)
+        assert frames["imu"]["t_ns"].to_list() == [1714564800 * 10**9]
+        assert summary.epoch_known
     frames, summary = read(tmp_path, "t,gx,gy,gz\n5,1,2,3\n2024-05-01T12:00:00Z,1,2,3\n")
     assert frames["imu"]["t_ns"].to_list() == [5 * 10**9]
     assert not summary.epoch_known

@@ -119,7 +119,7 @@ def mask_outliers(t: ArrayLike, q: ArrayLike, *, max_rate: float = 40.0) -> np.n
         # The first and last are seen only by their neighbours: one that is off while the next but one is not.
         for end, beside, beyond in ((0, 1, 2), (-1, -2, -3)):
             if bad[beside] and not bad[beyond]:
-                bad[end], bad[beside], score[end] = True, False, np.inf
+                bad[end], score[end] = True, np.inf  # which is worse than what is beside it
         worst = bad & (score >= np.r_[0.0, score[:-1]]) & (score >= np.r_[score[1:], 0.0])
         if not worst.any():
             break
@@ -198,8 +198,7 @@ def correlate(
     offset = 0.0
     if 0 < k < len(r) - 1:
         left, mid, right = r[k - 1], r[k], r[k + 1]
-        curvature = left - 2 * mid + right
-        offset = 0.5 * (left - right) / curvature if curvature < 0 else 0.0
+        offset = 0.5 * (left - right) / (left - 2 * mid + right)  # left < mid: the first of the highest is taken
     return float(lag[k] + offset * imu.interval_s), float(r[k]), runner_up, float((high - low) * imu.interval_s)
 
 

@@ -264,8 +264,7 @@ def attitude_sensitivity(dt: Array, model: Array, x: Array, first: Array) -> Arr
     """∫ R_nb [diag(x), I] dτ from each stretch's start, (n, 3, 6), trapezoidal; dt (n−1,) is 0 across starts."""
     r_nb = body_from_inertial(model).transpose(0, 2, 1)
     integrand = np.concatenate([r_nb * x[:, None, :], r_nb], axis=2).reshape(len(model), 18)
-    increments = np.empty_like(integrand)
-    increments[0] = 0.0
+    increments = np.zeros_like(integrand)
     increments[1:] = 0.5 * dt[:, None] * (integrand[1:] + integrand[:-1])
     total = np.cumsum(increments, axis=0)
     starts = np.flatnonzero(first)

@@ -219,7 +219,7 @@ def test_the_least_peak_is_the_callers() -> None:
     noisy = rate + 0.6 * np.random.default_rng(1).normal(size=rate.shape)
     peak = by_rates.synchronise(t, noisy, stamps, q, min_peak=0.0).peak
     assert 0.5 < peak < 0.99
-    assert by_rates.synchronise(t, noisy, stamps, q, min_peak=0.999 * peak).peak == peak
+    assert by_rates.synchronise(t, noisy, stamps, q, min_peak=peak).peak == peak
     with pytest.raises(UnusableFlight) as refused:
         by_rates.synchronise(t, noisy, stamps, q, min_peak=1.001 * peak)
     assert refused.value.reason_code == "flat_peak"
@@ -240,7 +240,7 @@ def test_how_short_a_record_may_be() -> None:
     for n, short in ((49, True), (50, False)):
         assert (code(t, rate, stamps[few][:n], q[few][:n]) == "vps_too_short") == short
         assert (code(t[:n], rate[:n], stamps, q) == "vps_too_short") == short
-    for duration_s, short in ((1.99, True), (2.01, False)):
+    for duration_s, short in ((1.9985, True), (2.0015, False)):  # 699 and 700 intervals
         part = stamps <= duration_s
         assert (code(t, rate, stamps[part], q[part]) == "vps_too_short") == short
 
@@ -257,3 +257,17 @@ def test_stamps_on_either_clock() -> None:
     assert fit.lag_s == pytest.approx(t[0] - vps[0])
     assert fit.lag_sd_s == pytest.approx(2e-3)
     assert fit.skew_sd_ppm == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("rate_hz", [185.0, 2000.0])
+def test_the_grid_is_the_imus_but_no_finer_than_a_millisecond(rate_hz: float) -> None:
+    """Told by the width of the peak, a whole number of steps; what the fit is about, by the IMU's stamps."""
+    t, rate, stamps, q = record(12.0)
+    own = 4.0 + np.arange(0.0, 12.0, 1.0 / rate_hz)
+    fit = by_rates.synchronise(own, np.stack([np.interp(own - 4.0, t, c) for c in rate.T], axis=1), stamps, q)
+    steps = fit.peak_width_s / max(1.0 / rate_hz, 1e-3)
+    assert steps == pytest.approx(round(steps), abs=1e-6)
+    assert steps > 10
+    assert fit.first_s == own[0]
+    assert fit.reference_s == pytest.approx(0.5 * (own[0] + own[-1]), rel=1e-12)
+    assert fit.lag_s == pytest.approx(4.0, abs=2e-3)
