@@ -14,7 +14,7 @@ TESTS: dict[str, Sequence[str]] = {
     "logs.csv": ("logs/test_csv_*.py", "logs/test_logs_csv*.py"),
     "logs.encodings": ("logs/test_encodings*.py", "logs/test_logs_mcap.py", "logs/test_logs_protobuf.py"),
     "logs.mcap": ("logs/test_mcap_*.py", "logs/test_logs_mcap*.py", "logs/test_logs_protobuf.py"),
-    "logs.mcap.chunks": ("logs/test_mcap_chunks.py",),
+    "logs.mcap.chunks": ("logs/test_mcap_chunks.py", "logs/test_mcap_file.py", "logs/test_logs_mcap_damage.py"),
     "logs.stamps": ("logs/test_stamps*.py",),
     "logs.tidy": ("logs/test_tidy*.py", "logs/test_stamps.py"),
     "estimation": ("estimation/test_*.py",),

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from fieldcal.config.parameters import Parameters
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.clock_sync import by_rates
 from fieldcal.geometry.rotation import from_rotation_vector, multiply
@@ -130,6 +133,11 @@ def test_what_the_filter_mixes_with_a_gap_or_an_end_is_masked() -> None:
     np.testing.assert_array_equal(found.valid, expected)
 
 
+def test_the_filters_reach_is_a_sample_at_least_of_slow_records() -> None:
+    found = by_rates._smoothed(by_rates.UniformRates(0.0, 0.06, np.ones((9, 3)), np.ones(9, dtype=bool)))
+    np.testing.assert_array_equal(found.valid, [False, *[True] * 7, False])
+
+
 # correlation ---------------------------------------------------------------------------------------------------------
 
 
@@ -173,6 +181,75 @@ def test_the_peaks_width_and_the_best_correlation_beside_it() -> None:
     # The smaller copy alone is a perfect match: means and norms are those of what overlaps.
     assert peak == pytest.approx(correlation(twice, a, 300), abs=1e-9)
     assert runner_up == pytest.approx(correlation(twice, a, 0), abs=1e-9)
+
+
+def peak_written_out(a: np.ndarray, b: np.ndarray) -> tuple[float, float, float, float]:
+    """Lag, peak, runner-up and width from correlations at every lag with half an overlap, one by one."""
+    shifts = [s for s in range(1 - len(b), len(a)) if min(len(a), len(b) + s) - max(0, s) > min(len(a), len(b)) / 2]
+    pairs = [(a[max(0, s) : len(b) + s], b[max(0, -s) : len(a) - s]) for s in shifts]
+    r = [float(np.corrcoef(u, v)[0, 1]) if u.std() and v.std() else 0.0 for u, v in pairs]
+    k = low = high = int(np.argmax(r))
+    while r[low] >= 0.5 * r[k]:
+        low -= 1
+    while r[high] >= 0.5 * r[k]:
+        high += 1
+    return 0.1 * shifts[k], r[k], max(r[:low] + r[high + 1 :]), 0.1 * (high - low)
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_a_lopsided_peak_is_measured_on_either_side(backwards: bool) -> None:
+    """A saw-tooth against one short turn correlates along the saw-tooth; nothing else moves, so the runner-up stands
+    beside the peak."""
+    a, b = np.zeros(100), np.zeros(98)
+    a[40:60], b[50:53] = np.arange(20.0), 1.0
+    if backwards:
+        a, b = a[::-1], b[::-1]
+    lag, peak, runner_up, width = by_rates.correlate(uniform(a), uniform(b), 60.0, min_overlap_s=1e9)
+    expected = peak_written_out(a, b)
+    assert lag == pytest.approx(expected[0], abs=0.05)
+    assert 0.3 < expected[1] < 0.8  # half of it is not what one half over it is
+    assert (peak, runner_up, width) == pytest.approx(expected[1:], abs=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+@pytest.mark.parametrize("of_imu", [False, True])
+def test_units_of_either_record_do_not_change_the_correlation(scale: float, of_imu: bool) -> None:
+    rng = np.random.default_rng(3)
+    a = np.abs(rng.normal(size=300)).cumsum() % 7.0
+    b = a[40:240] + 0.3 * rng.uniform(size=200)
+    expected = by_rates.correlate(uniform(a), uniform(b), 60.0)
+    scales = (scale, 1.0) if of_imu else (1.0, scale)
+    found = by_rates.correlate(uniform(scales[0] * a), uniform(scales[1] * b), 60.0)
+    assert found == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(("n", "start", "stop"), [(1000, 800, 1000), (1000, 0, 200), (300, 40, 290)])
+def test_a_short_record_is_found_anywhere_in_a_long_one(n: int, start: int, stop: int) -> None:
+    """Stamps of both agree, so the lag is 0, whichever is the longer."""
+    a = np.abs(np.random.default_rng(4).normal(size=n))
+    long, short = uniform(a), uniform(a[start:stop], 0.1 * start)
+    for imu, vps in ((long, short), (short, long)):
+        lag, peak, _, _ = by_rates.correlate(imu, vps, 5.0)
+        assert lag == pytest.approx(0.0, abs=0.05)
+        assert peak > 0.999
+
+
+def test_the_largest_lag_belongs_to_the_search() -> None:
+    """Eighths are exact: a lag of 2 s is found with a limit of 2 s and not below it."""
+    a = np.abs(np.random.default_rng(5).normal(size=400))
+    valid = np.ones(300, dtype=bool)
+    imu, vps = (by_rates.UniformRates(0.0, 0.125, x[:, None] * X, valid) for x in (a[:300], a[16:316]))
+    assert by_rates.correlate(imu, vps, 2.0)[:2] == pytest.approx((2.0, 1.0), abs=0.05)
+    assert by_rates.correlate(imu, vps, 1.999)[1] < 0.5
+
+
+@pytest.mark.parametrize(("n", "gap_s"), [(100, 0.0), (100, 500.0)])
+def test_records_that_touch_or_lie_apart_have_no_peak(n: int, gap_s: float) -> None:
+    """The only lag of the search has no overlap, or there is none at all."""
+    a = np.abs(np.random.default_rng(6).normal(size=n))
+    lag, peak, _, _ = by_rates.correlate(uniform(a), uniform(a, 0.1 * (n - 1) + gap_s), 0.04)
+    assert peak <= 0.0
+    assert np.isfinite(lag)
 
 
 def test_a_fractional_lag_is_the_top_of_the_parabola() -> None:
@@ -233,6 +310,12 @@ def code(*arrays: np.ndarray, **options: float) -> str:
     return "synchronised"
 
 
+def test_limits_that_nobody_gives_are_the_configurations() -> None:
+    own = inspect.signature(by_rates.synchronise).parameters
+    for name in ("max_lag_s", "min_peak", "max_gap_s"):
+        assert own[name].default == Parameters.model_fields[f"vps_{name}"].default
+
+
 def test_how_short_a_record_may_be() -> None:
     """Fifty samples of either, two seconds of the VPS."""
     t, rate, stamps, q = record(10.0)
@@ -259,11 +342,11 @@ def test_stamps_on_either_clock() -> None:
     assert fit.skew_sd_ppm == pytest.approx(3.0)
 
 
-@pytest.mark.parametrize("rate_hz", [185.0, 2000.0])
-def test_the_grid_is_the_imus_but_no_finer_than_a_millisecond(rate_hz: float) -> None:
+@pytest.mark.parametrize(("rate_hz", "duration_s"), [(185.0, 12.0), (2000.0, 11.0), (2000.0, 12.0), (2000.0, 13.0)])
+def test_the_grid_is_the_imus_but_no_finer_than_a_millisecond(rate_hz: float, duration_s: float) -> None:
     """Told by the width of the peak, a whole number of steps; what the fit is about, by the IMU's stamps."""
-    t, rate, stamps, q = record(12.0)
-    own = 4.0 + np.arange(0.0, 12.0, 1.0 / rate_hz)
+    t, rate, stamps, q = record(duration_s)
+    own = 4.0 + np.arange(0.0, duration_s, 1.0 / rate_hz)
     fit = by_rates.synchronise(own, np.stack([np.interp(own - 4.0, t, c) for c in rate.T], axis=1), stamps, q)
     steps = fit.peak_width_s / max(1.0 / rate_hz, 1e-3)
     assert steps == pytest.approx(round(steps), abs=1e-6)
@@ -271,3 +354,65 @@ def test_the_grid_is_the_imus_but_no_finer_than_a_millisecond(rate_hz: float) ->
     assert fit.first_s == own[0]
     assert fit.reference_s == pytest.approx(0.5 * (own[0] + own[-1]), rel=1e-12)
     assert fit.lag_s == pytest.approx(4.0, abs=2e-3)
+
+
+# fit -----------------------------------------------------------------------------------------------------------------
+
+
+def swaying(seed: int, noise: float, *, runaway: float = 0.0, spikes: float = 0.0) -> tuple[np.ndarray, ...]:
+    """Two sines about two axes, and a turn about the third that grows e-fold in 10 s; spikes in a hundredth of the
+    gyroscope's readings. IMU and VPS sample together, so nothing is interpolated."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 40.0, 0.01)
+    sway = np.stack([np.sin(2.0 * t), np.cos(1.3 * t + 0.01 * t**2), 0.0 * t], axis=1)
+    rate = sway + runaway * np.exp(t / 10.0)[:, None] * np.array([0.0, 0.0, 1.0])
+    noisy = rate + noise * rng.normal(size=rate.shape)
+    noisy[rng.uniform(size=len(t)) < 0.01] += spikes
+    every = np.ones(len(t), dtype=bool)
+    return by_rates.UniformRates(0.0, 0.01, noisy, every), by_rates.UniformRates(0.0, 0.01, rate, every)
+
+
+def refined(pair: tuple[by_rates.UniformRates, by_rates.UniformRates], lag: float = 0.0) -> by_rates.SyncFit:
+    measured = {"peak": 1.0, "runner_up": 0.0, "peak_width_s": 0.1}
+    return by_rates._refine(*pair, lag, 0.0, 20.0, measured)
+
+
+@pytest.mark.parametrize("spikes", [0.0, 5.0])
+def test_a_turn_that_grows_exponentially_says_nothing_of_the_lag(spikes: float) -> None:
+    """Its derivative is itself, which M takes up: lag and skew are as uncertain as without it."""
+    without, with_it = (refined(swaying(0, 0.1, runaway=r, spikes=spikes)) for r in (0.0, 0.2))
+    assert with_it.lag_sd_s == pytest.approx(without.lag_sd_s, rel=0.1)
+
+
+def test_spikes_of_the_gyroscope_move_neither_the_lag_nor_what_is_claimed_of_it() -> None:
+    without, spiky = (refined(swaying(0, 0.1, spikes=s)) for s in (0.0, 3.0))
+    assert spiky.lag_sd_s == pytest.approx(without.lag_sd_s, rel=0.5)
+    assert abs(spiky.lag_mid_s) < 4.0 * without.lag_sd_s
+    np.testing.assert_allclose(spiky.matrix[:, :2], np.eye(3)[:, :2], atol=0.02)
+
+
+def test_the_fit_ends_at_the_same_clock_from_either_side() -> None:
+    early, late = (refined(swaying(0, 0.1), lag) for lag in (-0.05, 0.08))
+    assert early.lag_mid_s == pytest.approx(late.lag_mid_s, abs=1e-8)
+    assert early.skew_ppm == pytest.approx(late.skew_ppm, abs=1e-3)
+
+
+def test_what_the_vps_explains_is_the_share_of_the_variance() -> None:
+    """A gyroscope with a bias: the variance is about its mean; sines have 1/2, white noise what it has."""
+    imu, vps = swaying(0, 0.5)
+    fit = refined((replace(imu, rate=imu.rate + 3.0), vps))
+    signal = float(np.sum(np.var(vps.rate, axis=0)))
+    assert fit.explained == pytest.approx(signal / (signal + 3 * 0.5**2), abs=0.02)
+
+
+def test_the_refusal_says_what_was_found() -> None:
+    """A gyroscope of which a third is the VPS's motion and two thirds another's."""
+    t, rate, stamps, q = record(20.0)
+    other = np.stack([np.sin(2.3 * t), np.sin(3.1 * t), np.cos(1.7 * t)], axis=1)
+    with pytest.raises(UnusableFlight) as refused:
+        by_rates.synchronise(t, rate + 1.5 * other, stamps, q, min_peak=0.0)
+    found = refused.value.measured
+    assert refused.value.reason_code == "not_the_same_motion"
+    assert 0.1 < found["explained"] < 0.6
+    assert f"explains {found['explained']:.0%} of".replace("%", " %") in refused.value.sentence
+    assert f"known to {found['lag_sd_s'] * 1000.0:.2g} ms" in refused.value.sentence

@@ -82,7 +82,7 @@ def chunk_that_grows(times: float) -> bytes:
 def test_a_chunk_may_grow_to_sixty_four_times_its_size_for_nothing(
     tmp_path: Path, times: float, read: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mcap_file, "TOTAL_CAP_BYTES", 1000)
+    monkeypatch.setattr("fieldcal.logs.mcap.chunks.TOTAL_CAP_BYTES", 1000)
     (tmp_path / "a.mcap").write_bytes(MAGIC + chunk_that_grows(times) + record(15, bytes(4)))
     file = McapFile(tmp_path / "a.mcap")
     assert sum(len(block.starts) for block in file.blocks()) == read

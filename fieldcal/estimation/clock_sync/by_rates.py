@@ -183,7 +183,7 @@ def correlate(
         enough & (variance > floor), (cross(a, b) - sum_a * sum_b / overlap) / np.sqrt(np.maximum(variance, floor)), 0.0
     )
     shift = np.arange(size)
-    shift = np.where(shift > size // 2, shift - size, shift)
+    shift = np.where(shift < len(a), shift, shift - size)  # the VPS's first sample at one of the IMU's, or before all
     lag = imu.start_s - vps.start_s + shift * imu.interval_s
     r[np.abs(lag) > max_lag_s] = -1.0
     order = np.argsort(lag)
@@ -194,7 +194,7 @@ def correlate(
     high = k + int(np.argmax(r[k:] < 0.5 * r[k]))
     away = np.ones(len(r), dtype=bool)
     away[low : high + 1] = False
-    runner_up = float(r[away].max()) if away.any() else 0.0
+    runner_up = float(r[away].max())  # lags without overlap, at either end, are away
     offset = 0.0
     if 0 < k < len(r) - 1:
         left, mid, right = r[k - 1], r[k], r[k + 1]
@@ -285,7 +285,6 @@ def _refine(
     spline = CubicSpline(vps.t, vps.rate)
     slope = spline.derivative()
     skew = 0.0
-    matrix: Array = np.eye(3)
     t = imu.t
     for _ in range(12):
         # t_vps = (t − middle)(1 + skew) + middle − lag
