@@ -8,11 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from fieldcal.config.parameters import Parameters
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.clock_sync import by_rates
-from fieldcal.geometry.rotation import from_rotation_vector, multiply
+from fieldcal.estimation.statistics import least_squares_covariance
+from fieldcal.geometry.rotation import from_rotation_vector, multiply, propagate
 from fieldcal.simulation.experiment import Experiment, Motion
 
 X = np.array([1.0, 0.0, 0.0])
@@ -69,9 +71,22 @@ def test_stamps_that_crowd_count_as_a_tenth_of_a_millisecond(share: float, gone:
 
 def test_a_length_five_per_cent_off_is_no_attitude() -> None:
     t, q = np.arange(41) * 0.01, turned(np.zeros(41))
-    for place, length in ((5, 1.04), (10, 1.06), (15, 0.96), (20, 0.94)):
+    for place, length in ((5, 1.048), (10, 1.052), (15, 0.952), (20, 0.948)):
         q[place] *= length
     assert np.flatnonzero(~by_rates.mask_outliers(t, q)).tolist() == [10, 20]
+
+
+def test_a_jump_that_stays_is_no_outlier() -> None:
+    """Faster than any vehicle, but not there and back; within ten sigma."""
+    assert masked(np.arange(41) / 350.0, swinging(0.02, 0.0) + 0.15 * (np.arange(41) >= 20)) == []
+
+
+def test_outliers_beside_the_ends_and_at_them() -> None:
+    """Each alone is off; the ends' are told from their neighbours, whatever is wrong beyond those."""
+    for places in ([1], [39], [0], [40], [0, 4], [36, 40], [0, 4, 36, 40]):
+        angles = np.zeros(41)
+        angles[places] = 0.1
+        assert masked(np.arange(41) * 0.01, angles) == places
 
 
 def test_of_four_attitudes_none_is_judged_and_of_five_one_is() -> None:
@@ -90,27 +105,29 @@ def test_the_line_between_neighbours_is_taken_at_the_stamp() -> None:
 # grids ---------------------------------------------------------------------------------------------------------------
 
 
+def vps_at(t: np.ndarray, **options: float) -> by_rates.UniformRates:
+    return by_rates.vps_rates(t, turned(t), 0.01, **options)
+
+
+def imu_at(t: np.ndarray, **options: float) -> by_rates.UniformRates:
+    return by_rates.imu_rates(t, np.ones((len(t), 3)), 0.01, **options)
+
+
 def test_gaps_of_a_twentieth_and_a_tenth_of_a_second_are_crossed_and_longer_ones_are_not() -> None:
-    def vps(t: np.ndarray) -> by_rates.UniformRates:
-        return by_rates.vps_rates(t, turned(t), 0.01)
-
-    def imu(t: np.ndarray) -> by_rates.UniformRates:
-        return by_rates.imu_rates(t, np.ones((len(t), 3)), 0.01)
-
-    for rates, gap in ((vps, 0.05), (imu, 0.1)):
+    for rates, gap in ((vps_at, 0.05), (imu_at, 0.1)):
         for length, crossed in ((0.99 * gap, True), (1.02 * gap, False)):
             t = np.r_[np.arange(0.0, 1.0, 0.01), 0.99 + length + np.arange(0.0, 1.0, 0.01)]
             assert rates(t).valid.all() == crossed
+        sixteenths = np.arange(17) / 16.0
+        assert rates(sixteenths, max_gap_s=0.0625).valid.all()
 
 
 def test_a_gap_spoils_the_four_places_on_either_side() -> None:
-    """Nine samples are what the derivative is taken from."""
-    t = np.r_[np.arange(0.0, 1.0, 0.01), np.arange(1.5, 2.5, 0.01)]
-    found = by_rates.vps_rates(t, turned(t), 0.01)
-    bad = np.flatnonzero(~found.valid)
-    within = np.flatnonzero((found.t > 0.99 + 1e-9) & (found.t < 1.5 - 1e-9))
-    assert bad[0] in (within[0] - 4, within[0] - 5)
-    assert bad[-1] in (within[-1] + 4, within[-1] + 5)
+    """Nine samples are what the derivative is taken from. From 0.996 s to 1.504 s there is nothing."""
+    t = np.arange(0.0, 2.5, 0.004)
+    t = 5.0 + t[(t < 0.998) | (t > 1.502)]
+    found = vps_at(t)
+    assert np.flatnonzero(~found.valid).tolist() == list(range(96, 155))
     np.testing.assert_allclose(found.rate[found.valid], np.tile(X, (found.valid.sum(), 1)), atol=1e-4)
     assert len(found.t) == len(found.rate) == 249
 
@@ -124,12 +141,12 @@ def test_rates_between_stamps_are_linear_and_end_with_the_record() -> None:
 
 
 def test_what_the_filter_mixes_with_a_gap_or_an_end_is_masked() -> None:
-    """Half a period of 8 Hz on either side: six samples of a hundredth of a second."""
+    """Half a period of 8 Hz on either side: sixteen samples of a 256th of a second."""
     valid = np.ones(200, dtype=bool)
     valid[100] = False
-    found = by_rates._smoothed(by_rates.UniformRates(0.0, 0.01, np.ones((200, 3)), valid))
+    found = by_rates._smoothed(by_rates.UniformRates(0.0, 1.0 / 256.0, np.ones((200, 3)), valid))
     expected = np.ones(200, dtype=bool)
-    expected[[*range(6), *range(94, 107), *range(194, 200)]] = False
+    expected[[*range(16), *range(84, 117), *range(184, 200)]] = False
     np.testing.assert_array_equal(found.valid, expected)
 
 
@@ -155,6 +172,17 @@ def test_only_lags_with_enough_overlap_count(n: int, shift: int, counts: bool) -
     b = np.r_[np.abs(rng.normal(size=shift)), a][:n]
     lag, peak, _, _ = by_rates.correlate(uniform(a), uniform(b), 60.0)
     assert (peak > 0.999 and lag == pytest.approx(-0.1 * shift, abs=0.05)) == counts
+
+
+@pytest.mark.parametrize(("shared", "counts"), [(31, True), (29, False)])
+def test_half_of_the_shorter_record_is_enough(shared: int, counts: bool) -> None:
+    """Sixty samples of which so many are the first of two hundred."""
+    rng = np.random.default_rng(1)
+    a = np.abs(rng.normal(size=200))
+    b = np.r_[np.abs(rng.normal(size=60 - shared)), a[:shared]]
+    for imu, vps, lag_s in ((a, b, -0.1 * (60 - shared)), (b, a, 0.1 * (60 - shared))):
+        lag, peak, _, _ = by_rates.correlate(uniform(imu), uniform(vps), 60.0)
+        assert (peak > 0.999 and lag == pytest.approx(lag_s, abs=0.05)) == counts
 
 
 def test_the_peaks_width_and_the_best_correlation_beside_it() -> None:
@@ -250,6 +278,7 @@ def test_records_that_touch_or_lie_apart_have_no_peak(n: int, gap_s: float) -> N
     lag, peak, _, _ = by_rates.correlate(uniform(a), uniform(a, 0.1 * (n - 1) + gap_s), 0.04)
     assert peak <= 0.0
     assert np.isfinite(lag)
+    assert gap_s or lag == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_fractional_lag_is_the_top_of_the_parabola() -> None:
@@ -416,3 +445,59 @@ def test_the_refusal_says_what_was_found() -> None:
     assert 0.1 < found["explained"] < 0.6
     assert f"explains {found['explained']:.0%} of".replace("%", " %") in refused.value.sentence
     assert f"known to {found['lag_sd_s'] * 1000.0:.2g} ms" in refused.value.sentence
+
+
+def test_covariance_is_that_of_lag_and_skew_among_twelve_coefficients() -> None:
+    """All 14 columns by finite differences and by definition; three seconds of the gyroscope are wrong."""
+    imu, vps = swaying(0, 0.1)
+    imu.rate[1000:1300] += 5.0 * np.sin(np.arange(300.0) / 7.0)[:, None]
+    fit = refined((imu, vps))
+    spline = CubicSpline(vps.t, vps.rate)
+
+    def rates(lag: float, skew: float) -> np.ndarray:
+        return spline((imu.t - 20.0) * (1 + skew) + 20.0 - lag)
+
+    lag, skew = fit.lag_mid_s, 1e-6 * fit.skew_ppm
+    x = np.column_stack([rates(lag, skew), np.ones(4000)])
+    (affine, residual, _), weight = by_rates._regressed(x, imu.rate)
+    columns = np.zeros((4000, 3, 14))
+    for i, (dl, ds) in enumerate(((1e-4, 0.0), (0.0, 1e-5))):
+        columns[:, :, i] = (rates(lag + dl, skew + ds) - rates(lag - dl, skew - ds)) @ affine[:3] / (2 * (dl + ds))
+    for channel in range(3):
+        columns[:, channel, 2 + 4 * channel : 6 + 4 * channel] = x
+    root = np.sqrt(weight)[:, None]
+    expected = least_squares_covariance(columns * root[:, :, None], residual * root)[1][:2, :2]
+    sd = np.sqrt(np.diagonal(expected))
+    np.testing.assert_allclose(fit.covariance / np.outer(sd, sd), expected / np.outer(sd, sd), atol=0.02)
+
+
+def with_noise(level: float) -> dict[str, float]:
+    """What is measured of a sway and a gyroscope with so much noise; whether it was accepted."""
+    imu, vps = swaying(0, level)
+    q = propagate(vps.t, vps.rate, np.array([0.0, 0.0, 0.0, 1.0]))
+    try:
+        fit = by_rates.synchronise(imu.t, imu.rate, vps.t, q, min_peak=0.0)
+    except UnusableFlight as refused:
+        return {**refused.measured, "accepted": 0.0}
+    return {"explained": fit.explained, "lag_sd_s": fit.lag_sd_s, "accepted": 1.0}
+
+
+@pytest.mark.parametrize(("explained", "accepted"), [(0.62, True), (0.58, False)])
+def test_sixty_per_cent_of_the_variance_are_enough(explained: float, accepted: bool) -> None:
+    """Noise over signal is (1 - x)/x, and grows with the square of the level."""
+    first = with_noise(2.0)
+    ratio = (1.0 / explained - 1.0) / (1.0 / first["explained"] - 1.0)
+    found = with_noise(2.0 * float(np.sqrt(ratio)))
+    assert found["explained"] == pytest.approx(explained, abs=0.015)
+    assert found["lag_sd_s"] < 0.0099
+    assert bool(found["accepted"]) == accepted
+
+
+@pytest.mark.parametrize(("lag_sd_s", "accepted"), [(0.0096, True), (0.0104, False)])
+def test_a_lag_known_to_ten_milliseconds_is_known(lag_sd_s: float, accepted: bool) -> None:
+    """The standard deviation grows with the level of the noise; a slow strong turn keeps the variance explained."""
+    found = with_noise(2.0 * lag_sd_s / with_noise(2.0, sway=2.0)["lag_sd_s"], sway=2.0)
+    print(found)
+    assert found["lag_sd_s"] == pytest.approx(lag_sd_s, abs=0.0003)
+    assert found["explained"] > 0.65
+    assert bool(found["accepted"]) == accepted

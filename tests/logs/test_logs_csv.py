@@ -168,7 +168,23 @@ def test_an_unterminated_last_row_is_dropped_and_told(tmp_path: Path, table: Tab
     for cut in (1, 3, 60):
         frames, summary = read(tmp_path, text[:-cut])
         table.check(frames, slice(-1))
-        assert [(finding.code, finding.loses_data) for finding in summary.findings] == [("unterminated_row", True)]
+        assert [(f.code, f.count, f.loses_data) for f in summary.findings] == [("unterminated_row", 1, True)]
+
+
+def test_a_time_behind_the_cells_of_a_short_first_row(tmp_path: Path) -> None:
+    frames, summary = read(tmp_path, "gx,gy,gz,t_s\n1,2,3\n1,2,3,0.5\n4,5,6,0.6\n7,8,9,0.7\n")
+    assert frames["imu"]["t_ns"].to_list() == [500_000_000, 600_000_000, 700_000_000]
+    assert [(f.code, f.count) for f in summary.findings] == [("ragged_row", 1)]
+
+
+def test_a_row_with_half_a_sensor_and_no_time_is_counted_once(tmp_path: Path) -> None:
+    _, summary = read(tmp_path, "t_s,gx,gy,gz\n0.1,1,2,3\nx,1,,3\nx,1,2,3\n0.4,1,2,3\n")
+    assert [(f.code, f.count) for f in summary.findings] == [("incomplete_row", 1), ("bad_time", 1)]
+
+
+def test_headers_alone_are_no_rows(tmp_path: Path) -> None:
+    """However often: none of them is ragged."""
+    assert refusal(tmp_path, (HEADER + "\n") * 3).reason_code == "no_rows"
 
 
 def test_short_long_damaged_and_wordy_rows_are_counted_with_their_line(tmp_path: Path, table: Table) -> None:
@@ -257,7 +273,7 @@ def test_a_folder_and_one_with_a_broken_vps(tmp_path: Path, table: Table) -> Non
         (tmp_path / "vps.csv").write_text(broken)
         frames, summary = read_log(tmp_path, vehicle())
         table.check(frames)
-        assert [(finding.code, finding.loses_data) for finding in summary.findings] == [("vps_unreadable", True)]
+        assert [(f.code, f.count, f.loses_data) for f in summary.findings] == [("vps_unreadable", 1, True)]
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from logs_support import Flight, vehicle
 
+from fieldcal.config.configuration import Vehicle
+from fieldcal.config.flight_settings import flight_settings
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs import Columns, Finding, LogSummary, ingest
 from fieldcal.logs.ingest import (
@@ -185,11 +187,51 @@ def test_the_gravest_finding_gives_the_verdict() -> None:
         assert [f["count"] for f in judged["findings"]] == [f.count for f in findings]
 
 
-def test_a_log_in_disorder_is_read_again_whole(tmp_path: Path) -> None:
+@pytest.mark.parametrize("late", [False, True])
+def test_a_log_in_disorder_is_read_again_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, late: bool) -> None:
     """Ever later stamps, then the first ones: more than what is held back while streaming."""
-    order = np.r_[np.arange(3000, 150_000), np.arange(3000)]
+    monkeypatch.setattr(ingest, "HELD_ROWS", 100)
+    order = np.r_[np.arange(300, 1500), np.arange(300)] if late else np.arange(1500)
     (tmp_path / "log.csv").write_text("t,gx,gy,gz\n" + "".join(f"{i / 100},{i},0,0\n" for i in order))
+    opened: list[bool] = []
+
+    def opening(path: Path, of: Vehicle, *, whole: bool) -> TidyLog:
+        opened.append(whole)
+        return tidy_log(path, of, whole=whole)
+
+    monkeypatch.setattr(ingest, "tidy_log", opening)
+    monkeypatch.setattr("fieldcal.logs.csv.text.BLOCK_BYTES", 4096)
     frames, facts = read_flight(tmp_path / "log.csv", vehicle())
-    assert facts["n_samples"] == 150_000
-    assert frames["imu"]["gyroscope_x"].to_list() == list(range(150_000))
-    assert ingest.LEAST_SAMPLES < 20
+    assert opened == [False, True][: 1 + late]
+    assert facts["n_samples"] == 1500
+    assert frames["imu"]["gyroscope_x"].to_list() == list(range(1500))
+
+
+def test_rows_are_handed_on_while_reading_unless_they_are_to_be_held(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ingest, "HELD_ROWS", 50)
+    batch = ("imu", table(*IMU, n=200))
+    assert len(list(TidyLog(Reader(batch), "a.csv").tables())) == 2
+    assert len(list(TidyLog(Reader(batch), "a.csv", whole=True).tables())) == 1
+    (tmp_path / "log.csv").write_text("t,gx,gy,gz\n" + "".join(f"{i / 100},{i},0,0\n" for i in range(200)))
+    assert len(list(tidy_log(tmp_path / "log.csv", vehicle()).tables())) == 2
+
+
+@pytest.mark.parametrize("first_ns", [0, -19 * STEP_NS])
+def test_a_flight_may_begin_or_end_at_zero(first_ns: int) -> None:
+    facts = read(("imu", table(*IMU, n=20, first_ns=first_ns))).facts()
+    assert facts["duration_s"] == pytest.approx(0.19, abs=1e-12)
+
+
+def test_the_place_is_the_means_with_unknown_heights_at_sea_level(tmp_path: Path) -> None:
+    place = {"latitude_deg": np.array([50.0, 52.0]), "longitude_deg": np.array([8.0, 10.0])}
+    facts = read(("imu", table(*IMU)), ("position", table(n=2, altitude_m=np.full(2, np.nan), **place))).facts()
+    assert facts["position"] == [51.0, 9.0, 0.0]
+    facts["position"] = [51.0, 9.0, 200.0]
+    settings = settings_of(facts, vehicle())
+    expected = flight_settings(
+        vehicle(), units=facts["units"], world="ned", body=None, gravity_sign=None, position=(51.0, 9.0, 200.0),
+        started_at=None,
+    )  # fmt: skip
+    assert settings == expected

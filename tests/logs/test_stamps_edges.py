@@ -86,7 +86,9 @@ def test_only_stamps_a_counter_can_hold_wrap(batch: int) -> None:
 
 
 @pytest.mark.parametrize("batch", [1, 8])
-@pytest.mark.parametrize("jump", [(-S, COUNTERS_NS["us"] - 2 * S), (2 * S, COUNTERS_NS["us"] + S)])
+@pytest.mark.parametrize(
+    "jump", [(-S, COUNTERS_NS["us"] - 2 * S), (2 * S, COUNTERS_NS["us"]), (2 * S, COUNTERS_NS["us"] + S)]
+)
 def test_jumps_of_nearly_a_period_outside_the_counter_are_none_of_its_wraps(jump: tuple[int, int], batch: int) -> None:
     """After a wrap; one end of the jump lies outside what the counter holds."""
     period = COUNTERS_NS["us"]
@@ -251,3 +253,46 @@ def test_nine_strays_in_a_row_do_not_outvote_their_neighbours(n: int) -> None:
     t = stretch(200, 100 * S)
     t[100 : 100 + n] = 300 * S + stretch(n, step=50 * S)
     assert np.flatnonzero(judged(t).wild).tolist() == list(range(100, 100 + n))
+
+
+def test_ten_strays_in_a_row_do_not_outvote_their_neighbours_either() -> None:
+    """Eleven of the 21 about each are sound, of whichever side. They step back, so they are no run."""
+    t = stretch(200, 100 * S)
+    t[100:110] = 300 * S - stretch(10, step=1_000_000)
+    assert np.flatnonzero(judged(t).wild).tolist() == list(range(100, 110))
+
+
+@pytest.mark.parametrize(("place", "wild"), [(0, False), (STEP // 2, True)])
+@pytest.mark.parametrize("side", ["first", "last"])
+def test_a_stray_at_an_end_repeats_it_and_within_the_outermost_interval_it_has_no_hole(
+    place: int, wild: bool, side: str
+) -> None:
+    t = stretch(2001)
+    stray = place if side == "first" else int(t[-1]) - place
+    found = judged(np.r_[t[:1000], stray, t[1000:]])
+    assert found.wild.tolist() == [wild and i == 1000 for i in range(2002)]
+
+
+@pytest.mark.parametrize("step", [1, 2, STEP])
+@pytest.mark.parametrize("times", [1, 3])
+def test_a_clock_is_judged_in_its_own_intervals(step: int, times: int) -> None:
+    """However fine they are, and when every stamp stands in several rows. A pause of eleven intervals begins another
+    run; the clock, set back in the end, claims 20 intervals twice."""
+    once = np.r_[stretch(50, 0, step), stretch(50, 60 * step, step), stretch(50, 90 * step, step)]
+    t = np.repeat(once, times)
+    found = judged(t)
+    assert found.stretch.tolist() == [0] * 100 * times + [1] * 50 * times
+    assert (found.back_ns, found.far, found.wild.any()) == (20 * step, 0, False)
+
+
+def test_of_two_clocks_set_back_the_farther_is_told() -> None:
+    t = np.r_[stretch(100), stretch(100, 94 * STEP + 1), stretch(100, 174 * STEP + 2), stretch(100, 268 * STEP + 3)]
+    found = judged(t)
+    assert found.stretch.tolist() == np.repeat(range(4), 100).tolist()
+    assert found.back_ns == 20 * STEP - 1
+
+
+def test_nanosecond_steps_alone_are_a_run() -> None:
+    found = judged(np.r_[stretch(50, 0, 1), stretch(50, 30, 1)])
+    assert found.stretch.tolist() == [0] * 50 + [1] * 50
+    assert found.back_ns == 20
