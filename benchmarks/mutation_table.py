@@ -61,6 +61,8 @@ _ALGORITHM = "another algorithm for the same inverse"
 _RCOND = "rounding and what is seen lie orders apart on either side"
 _ROUNDS = "another round of reweighting moves a small part of the standard deviation"
 _ENDS_MASKED = "the low-pass has masked the places at the ends"
+_TURNED = "which attitudes are also solved in frames that are turned by half; the result is the same"
+_DOWN = "another way down to the same minimum"
 
 EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     (
@@ -988,5 +990,44 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "inside = (nearest >= 1) & (nearest < len(vps.rate) - 1) & imu.valid",
         "< → <=",
     ): _ENDS_MASKED,
+    ("estimation.ellipsoid", "_gauss_newton", "if (trial > 0.3 * diagonal).all():", "0.3 → 0.33"): _DOWN,
+    (
+        "estimation.ellipsoid",
+        "_gauss_newton",
+        "if not np.isfinite(size) or diagonal.max() > 1e6 or diagonal.min() < 1e-9:",
+        "1000000.0 → 1100000.0",
+    ): "a fit that runs away passes any such limit",
+    (
+        "estimation.gyroscope.output_error",
+        "fit_output_error",
+        "dt = np.where(first[1:], 0.0, np.diff(t))",
+        "0.0 → 1.0",
+    ): "sensitivities count from a stretch's start, and over a stretch they sum up to nothing",
+    (
+        "estimation.gyroscope.output_error",
+        "fit_output_error",
+        "if (np.abs(step) < np.maximum(0.02 * claimed, 1e-8 * float(np.max(np.abs(theta))))).all():",
+        "* → / #2",
+    ): _CONVERGED,
+    (
+        "logs.tidy",
+        "TidySignal._clock_findings",
+        'f"{name}: {table} pauses {self.gaps} time(s) for over {GAP_NS * 1e-9:.0f} s, at the longest for "',
+        "1e-09 → 1.1000000000000001e-09",
+    ): "told in whole seconds",
+    (
+        "logs.tidy",
+        "TidySignal.add",
+        'held = pl.concat(self._held).sort("t_ns", maintain_order=True)',
+        "True → False",
+    ): "Polars sorts by one column stably, which it does not promise",
+    (
+        "logs.tidy",
+        "TidySignal.finish",
+        'yield self._one_a_stamp(held.sort("t_ns", maintain_order=True))',
+        "True → False",
+    ): "Polars sorts by one column stably, which it does not promise",
+    ("estimation.wahba", "_quest_solution", "derivative = (4 * lam * lam - 2 * ab) * lam - c", "- → +"): _TURNED,
+    ("estimation.wahba", "_quest_solution", "derivative = (4 * lam * lam - 2 * ab) * lam - c", "- → + #2"): _TURNED,
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

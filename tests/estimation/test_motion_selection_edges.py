@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
+
 import numpy as np
 import pytest
 
+from fieldcal.config.parameters import Parameters
 from fieldcal.estimation import motion_selection
 from fieldcal.estimation.motion_selection import contiguous, select, windowed_rate
 
@@ -130,3 +133,9 @@ def test_stamps_that_stand_split_like_a_backward_step() -> None:
     assert contiguous([0.0, 1.0, 2.5], 1.0) == [(0, 2), (2, 3)]
     assert select(np.r_[0.0:0.5:0.01, 0.585:1.0:0.01], None).segments[0].stop > 60
     assert len(select(np.r_[0.0:0.5:0.01, 0.595:1.0:0.01], None).segments) == 2
+
+
+def test_limits_that_nobody_gives_are_the_configurations() -> None:
+    own = inspect.signature(select).parameters
+    for name in ("window_s", "pad_s", "rest_s", "min_s", "max_gap_s", "excited_ratio"):
+        assert own[name].default == Parameters.model_fields[f"manoeuvre_{name}"].default

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
+from fieldcal.config.parameters import Parameters
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation import warm_up
 from fieldcal.estimation.warm_up import fit_resting_accelerometer, fit_warm_up, rest_windows
@@ -154,3 +158,9 @@ def test_the_longest_run_has_no_pause_of_more_than_a_window_and_a_half() -> None
     assert run(1, 3, 6.1) == [0, 1]
     assert run() == []
     assert run(4) == [0]
+
+
+@pytest.mark.parametrize("function", [rest_windows, fit_warm_up, fit_resting_accelerometer])
+def test_pauses_that_nobody_limits_are_the_configurations(function: Callable[..., object]) -> None:
+    own = inspect.signature(function).parameters["max_gap_s"]
+    assert own.default == Parameters.model_fields["manoeuvre_max_gap_s"].default

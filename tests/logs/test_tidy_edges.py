@@ -249,3 +249,16 @@ def test_the_period_of_a_counter_is_told_in_seconds() -> None:
     _, signal = tidied(imu(t_ns), 7)
     assert told(signal) == {"clock_wrapped": 1}
     assert "began again 1 time(s) after 4294.967 s" in sentence(signal, "clock_wrapped")
+
+
+@pytest.mark.parametrize("held", [50, None])
+def test_of_rows_with_one_stamp_the_first_recorded_is_kept_in_disorder_too(held: int | None) -> None:
+    """Four rows a stamp, every second stamp before the one that it follows."""
+    stamp = np.repeat(np.arange(200) ^ 1, 4)
+    columns = imu(STEP_NS * stamp)
+    columns["gyroscope_x"] = np.arange(800.0)
+    signal = TidySignal("imu", held)
+    parts = [part for i in range(0, 800, 80) for part in signal.add(rows(columns, slice(i, i + 80)))]
+    kept = pl.concat([*parts, *signal.finish()])
+    assert kept["t_ns"].to_list() == steady(200).tolist()
+    assert kept["gyroscope_x"].to_list() == [4.0 * (i ^ 1) for i in range(200)]
