@@ -16,6 +16,11 @@ that does not come from the module (a closed form, another library, the simulato
 the code does nothing there: delete it. Or the change can't be seen from outside, because both forms give the same for
 every input: add it to `EQUIVALENT` there, with the reason. No more than 1 in 20 may live, equivalents aside.
 
+`<` and `<=` are drawn between measured real numbers too, which no test can make equal: such changes are listed one by
+one. Where a count, an integer stamp or a number that is exact in binary meets its limit, a test shows which it is. What
+is said to be converged has a test that another start ends at the same place; only then may a tolerance or a cap be
+listed.
+
 A fast path needs tests of its own that fail when it is not taken: behind it stands a slow one that gives the same.
 """
 

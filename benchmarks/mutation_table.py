@@ -1029,5 +1029,25 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): "Polars sorts by one column stably, which it does not promise",
     ("estimation.wahba", "_quest_solution", "derivative = (4 * lam * lam - 2 * ab) * lam - c", "- → +"): _TURNED,
     ("estimation.wahba", "_quest_solution", "derivative = (4 * lam * lam - 2 * ab) * lam - c", "- → + #2"): _TURNED,
+    (
+        "estimation.motor_field",
+        "_correlation",
+        "y = residual - jacobian[:, ELLIPSOID_PARAMETERS:] @ k  # what the residual would be without k",
+        "- → +",
+    ): "the residual of the least squares is orthogonal to what k does",
+    (
+        "estimation.uncertainty_propagation",
+        "constants_to_equation",
+        "spread = np.sqrt(np.average((rate_logged - centre) ** 2, axis=0, weights=weight))",
+        "- → +",
+    ): "a scale near that of the regressors, for the digits alone",
+    ("estimation.warm_up", "_longest_run", "return slice(0, 0)", "0 → 1"): "any slice of no windows is empty",
+    ("estimation.warm_up", "_longest_run", "return slice(0, 0)", "0 → 1 #2"): "any slice of no windows is empty",
+    (
+        "logs.csv.rows",
+        "_silent",
+        "for line in np.flatnonzero((ends - starts < 64) & blank & ~silent).tolist():",
+        "< → <=",
+    ): "no logger writes lines of that many blanks",
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

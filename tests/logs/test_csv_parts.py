@@ -35,6 +35,7 @@ def test_where_the_data_begin() -> None:
     assert dialect('"SEP=|"\nt|gx\n1|2\n').separator == "|"
     assert dialect("sep=;\nt,gx\n1,2\n", ",").separator == ","
     assert dialect("sep=;\n").names == ("sep=", "")
+    assert dialect("sep=;\nt;gx\n").names == ("t", "gx")
     assert dialect("# x\n# t,gx\n0.1,2\n") == Dialect(",", ".", ("t", "gx"), b"", None, 2)
     assert dialect("t  gx\n1 2\n") == Dialect(" ", ".", ("t", "gx"), b"t gx", None, 1)
     assert dialect('"t","gx"\n1,2\n').header == b"t,gx"
