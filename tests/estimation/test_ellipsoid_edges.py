@@ -7,7 +7,7 @@ import pytest
 from numerics_support import directions
 from scipy.optimize import least_squares
 
-from fieldcal.errors import UnusableFlight
+from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation import ellipsoid
 from fieldcal.estimation.ellipsoid import TriadFit, direction_condition, fit_ellipsoid
 from fieldcal.estimation.ellipsoid_refusals import require_determined
@@ -185,3 +185,14 @@ def test_a_scale_may_be_half_or_twice_its_nominal_value() -> None:
             require_determined(fit_of(), nominal_scale=nominal, **LIMITS)
         assert refused.value.reason_code == "scale_not_nominal"
         assert refused.value.measured["scale_over_nominal"] == pytest.approx(1.0 / np.array(nominal))
+
+
+def test_a_fit_without_a_minimum_says_how_far_off_it_was() -> None:
+    """One step from the truth, readings 1 % off the sphere."""
+    rng = np.random.default_rng(8)
+    x = directions(rng, 2000) * (1.0 + 0.01 * rng.normal(size=(2000, 1)))
+    with pytest.raises(EstimationError) as refused:
+        ellipsoid._gauss_newton(x, np.eye(3), np.zeros(3), robust=False, max_iterations=1)
+    assert refused.value.reason_code == "ellipsoid_diverged"
+    assert refused.value.measured["iterations"] == 1
+    assert refused.value.measured["residual_rms_relative"] == pytest.approx(0.01, rel=0.05)

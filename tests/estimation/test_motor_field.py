@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 import fieldcal
 from fieldcal.config.configuration import CsvMap, McapMap
 from fieldcal.errors import UnreadableLog
+from fieldcal.estimation import motor_field as numerics
 from fieldcal.estimation.motor_field import (
     FATAL_SHARE,
     REPORTED_SHARE,
@@ -403,3 +404,18 @@ def test_mcap_batteries_are_read_by_type_or_topic_and_as_magnitudes(tmp_path: Pa
 def test_a_log_without_a_current_has_no_such_table(tmp_path: Path) -> None:
     frames, _ = read_log(battery_log(tmp_path / "log.mcap", {}), vehicle())
     assert set(frames) == {"imu"}
+
+
+def test_fifty_steps_are_the_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    """When no step is small enough nothing is said."""
+    steps: list[None] = []
+    real = numerics._residual
+
+    def counted(h: np.ndarray, u: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        steps.append(None)
+        return real(h, u, theta)
+
+    monkeypatch.setattr(numerics, "_residual", counted)
+    monkeypatch.setattr(numerics, "CONVERGED_STEP", 0.0)
+    assert motor_field(field_ut(), current_a(0, len(field_ut()), 0.99), FIELD_UT) is None
+    assert len(steps) == 50

@@ -96,3 +96,9 @@ def test_a_matrix_that_is_a_rotation_but_for_its_length_becomes_a_unit_quaternio
     for method in sorted(wahba.METHODS):
         found = wahba.attitudes(sensed(q, LEVEL), LEVEL, [0.1, 0.2], method=method).q
         np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, rtol=1e-12)
+
+
+def test_what_shapes_are_wanted_is_said_of_two_vectors_too() -> None:
+    observed = np.tile(np.eye(3)[:2], (5, 1, 1))
+    with pytest.raises(ValueError, match=r"reference must be \(2, 3\) and sigma positive \(2,\)"):
+        wahba.attitudes(observed, np.eye(3)[:2], np.ones(3))
