@@ -1049,5 +1049,12 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "for line in np.flatnonzero((ends - starts < 64) & blank & ~silent).tolist():",
         "< → <=",
     ): "no logger writes lines of that many blanks",
+    ("estimation.ellipsoid", "_gauss_newton", "if (trial > 0.3 * diagonal).all():", "all → any"): _DOWN,
+    (
+        "estimation.ellipsoid",
+        "_gauss_newton",
+        "if float(weight @ after.residual**2) <= cost * (1 + SLACK) + 1e-24:",
+        "<= → <",
+    ): _NEVER_MET,
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""
