@@ -29,6 +29,15 @@ STUCK_RATIO = 50.0
 HOLDS_LEFT_OUT = 10
 """… without so many of the longest, which may be those of a stuck channel)."""
 
+COARSE_SHARE = 0.1
+"""Largest step of a channel's resolution, as a share of its standard deviation: errors of one per cent."""
+
+ROUNDING_SHARE = 1e-9
+"""Steps below this share of a channel's largest value are rounding of floating point."""
+
+STILL_STEPS = 2.0
+"""Steps of its resolution that an axis may take while the sensor lies still."""
+
 STUCK_SHARE = 0.02
 """Share of the recording that may be stuck."""
 
@@ -111,7 +120,9 @@ def channel_faults(sensor: str, t: ArrayLike, logged: ArrayLike, unit: str, si_s
         if dead is not None:
             faults.append(dead)
             continue
-        faults += [f for f in (_stuck(sensor, axis, t, x[:, i], unit), _clipped(sensor, axis, x[:, i], unit)) if f]
+        beside = np.delete(x, i, axis=1)
+        found = _stuck(sensor, axis, t, x[:, i], beside, unit), _clipped(sensor, axis, x[:, i], unit)
+        faults += [fault for fault in found if fault is not None]
         if si_scale is not None and sensor in LARGEST_NOISE_SI:
             random = _random(sensor, axis, x[:, i] * si_scale, LARGEST_NOISE_SI[sensor])
             faults += [random] if random else []
@@ -126,22 +137,50 @@ def _dead(sensor: str, axis: str, x: Array, unit: str) -> Fault | None:
     return Fault(sensor, axis, code, 1.0, STUCK_SHARE, True, sentence)
 
 
-def _stuck(sensor: str, axis: str, t: Array, x: Array, unit: str) -> Fault | None:
-    """A value that is held for far longer than the channel holds values otherwise."""
+def _stuck(sensor: str, axis: str, t: Array, x: Array, beside: Array, unit: str) -> Fault | None:
+    """A value that is held for far longer than the channel holds values otherwise, unless the axes `beside` (n, 2) show
+    a coarse sensor that lies still."""
     start = run_starts(x)
     end = np.r_[start[1:], len(x)] - 1
     held = t[end] - t[start]
     usual = float(np.quantile(np.sort(held)[: max(1, len(held) - HOLDS_LEFT_OUT)], 0.99))
     limit = max(STUCK_S, STUCK_RATIO * usual)
     stuck = held > limit
+    step = np.array([np.diff(np.unique(column)).min(initial=np.inf) for column in beside.T])
+    for k in np.flatnonzero(stuck):
+        moved = np.ptp(beside[start[k] : end[k] + 1], axis=0)
+        # All axes without any change at all: the logger froze.
+        stuck[k] = bool(np.any(moved > STILL_STEPS * step) or not moved.any())
     if not stuck.any():
         return None
-    share, longest = float(held[stuck].sum() / (t[-1] - t[0])), int(np.argmax(held))
+    share, longest = float(held[stuck].sum() / (t[-1] - t[0])), int(np.argmax(held * stuck))
     sentence = (
         f"The {sensor}'s {axis} stands at {x[start[longest]]:.6g} {unit} for {held[longest]:.1f} s"
         f" ({100 * share:.1f} % of the recording in all) where it else changes within {usual:.3g} s: it was stuck."
     )
     return Fault(sensor, axis, ReasonCode.STUCK, share, STUCK_SHARE, share > STUCK_SHARE, sentence)
+
+
+def resolution(x: Array) -> float:
+    """Least step between different values of a channel (n,), rounding of floating point apart; 0 with one value."""
+    levels = np.unique(x)
+    steps = np.diff(levels)
+    steps = steps[steps > ROUNDING_SHARE * np.max(np.abs(levels), initial=0.0)]
+    return float(steps.min(initial=np.inf)) if len(steps) else 0.0
+
+
+def coarse_faults(sensor: str, logged: ArrayLike, unit: str) -> list[Fault]:
+    """Axes of readings (n, 3) so coarse that their rounding, which goes with the motion, is no noise."""
+    faults = []
+    for axis, x in zip(AXES, np.asarray(logged, dtype=float).T, strict=True):
+        step, spread = resolution(x), float(np.std(x))
+        if step > COARSE_SHARE * spread > 0.0:
+            sentence = (
+                f"The {sensor}'s {axis} is logged in steps of {step:.3g} {unit} where it varies by {spread:.3g} {unit}"
+                " rms: rounding of a tenth and more goes with the motion and is no noise."
+            )
+            faults.append(Fault(sensor, axis, ReasonCode.COARSE, step / spread, COARSE_SHARE, True, sentence))
+    return faults
 
 
 def _clipped(sensor: str, axis: str, x: Array, unit: str) -> Fault | None:

@@ -58,4 +58,5 @@ def _faults_of(sensor: Sensor, t: Array, readings: Array, s: SanitySettings) -> 
     elif sensor == Sensor.GYROSCOPE and si_scale is not None:
         wrong = faults.gyroscope_unit(readings, unit, si_scale)
     dead = any(f.code in (ReasonCode.ALL_ZERO, ReasonCode.STUCK) and f.fatal for f in found)
-    return [*found, *([wrong] if wrong and not dead else []), *faults.sampling_faults(sensor, t)]
+    coarse = [] if dead else faults.coarse_faults(sensor, readings, unit)
+    return [*found, *coarse, *([wrong] if wrong and not dead else []), *faults.sampling_faults(sensor, t)]

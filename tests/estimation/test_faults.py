@@ -16,8 +16,10 @@ from fieldcal.estimation import faults
 from fieldcal.estimation.faults import (
     accelerometer_unit,
     channel_faults,
+    coarse_faults,
     gyroscope_unit,
     magnetometer_unit,
+    resolution,
     sampling_faults,
 )
 from fieldcal.names import SENSORS
@@ -347,3 +349,39 @@ def test_faults_of_a_flight_are_rows() -> None:
     found: dict[str, Any] = results["sanity"].measured["faults"][0]
     assert found["value"] == row["number"]
     assert replace(faults.Fault(**found)).sentence == row["reason"]
+
+
+def test_a_coarse_sensor_that_lies_still_is_not_stuck() -> None:
+    """Ten bits: for four seconds at rest one axis reads one value while the others step by one now and then."""
+    rng = np.random.default_rng(5)
+    t = np.arange(0.0, 30.0, 0.01)
+    moving = 400.0 + 60.0 * np.sin(2.0 * np.pi * np.outer(t, [0.5, 0.7, 0.9])) + rng.normal(size=(len(t), 3))
+    x = np.rint(moving)
+    still = slice(1000, 1400)
+    x[still] = 420.0
+    x[still, 0] += rng.integers(0, 2, 400)
+    x[still, 2] += rng.integers(0, 2, 400)
+    assert "stuck" not in {fault.code for fault in channel_faults("accelerometer", t, x, "counts", None)}
+    x[still, 0] = np.rint(moving[still, 0])  # the sensor turns, its y does not follow
+    assert [fault.axis for fault in channel_faults("accelerometer", t, x, "counts", None)] == ["y"]
+    x[still] = 420.0  # nothing changes at all: the logger froze
+    assert {fault.axis for fault in channel_faults("accelerometer", t, x, "counts", None)} == {"x", "y", "z"}
+
+
+def test_values_too_coarse_for_their_motion_are_refused_with_the_step() -> None:
+    rng = np.random.default_rng(6)
+    t = np.arange(0.0, 30.0, 0.01)
+    x = 5.0 * np.sin(2.0 * np.pi * np.outer(t, [0.5, 0.7, 0.9])) + 0.01 * rng.normal(size=(len(t), 3))
+    (fault, *others) = coarse_faults("accelerometer", np.rint(x), "m/s^2")
+    assert [f.code for f in (fault, *others)] == ["coarse"] * 3
+    assert fault.fatal
+    assert "steps of 1 m/s^2" in fault.sentence
+    # A tenth of that is fine, whatever the unit's own rounding in floating point.
+    assert coarse_faults("accelerometer", np.rint(x * 10.0) / 10.0, "m/s^2") == []
+    assert coarse_faults("accelerometer", np.rint(x * 10.0) / 10.0 + 0.3, "m/s^2") == []
+
+
+def test_resolution_is_the_least_step() -> None:
+    assert resolution(np.array([3.0, 5.0, 5.0, 9.0])) == 2.0
+    assert resolution(np.full(4, 7.0)) == 0.0
+    assert resolution(np.array([0.1, 0.2, 0.1 + 0.2, 0.3])) == pytest.approx(0.1)
