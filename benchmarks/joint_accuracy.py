@@ -53,7 +53,7 @@ Figures = dict[str, list[float]]
 
 def measure(recording: SimulatedFlight, method: str, **changes: Any) -> Iterator[tuple[str, float]]:
     """(quantity, error) of one flight; "refused …" counts. `changes` replace parameters."""
-    own = settings(recording.experiment, method=method, lever_arm_m=None, **changes)
+    own = settings(recording.experiment, **{"method": method, "lever_arm_m": None, "use_vps": False, **changes})
     results = run_flight(signals(recording), own)
     squares, beyond = [], []
     for name in SENSORS:

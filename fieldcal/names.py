@@ -9,6 +9,9 @@ from typing import Literal, TypeAlias
 Json: TypeAlias = "Mapping[str, Json] | Sequence[Json] | str | float | bool | None"
 """Plain JSON; whole numbers are floats to the type check."""
 
+UseVps = bool | Literal["auto"]
+"""Whether a VPS enters the estimate: "auto" where there is a usable one."""
+
 Triple = tuple[float, float, float]
 """x, y, z."""
 Rotation = tuple[Triple, Triple, Triple]
@@ -36,10 +39,27 @@ VECTOR_SENSORS = (Sensor.MAGNETOMETER, Sensor.ACCELEROMETER)
 class Approach(StrEnum):
     """What `method` in `fieldcal.toml` chooses for a sensor."""
 
+    AUTO = "auto"
+    """Everything in one likelihood; one step after the other where that cannot run."""
     SERIAL = "serial"
     """One step after the other."""
     JOINT = "joint"
     """Everything in one likelihood."""
+
+
+class Rung(StrEnum):
+    """How much the joint estimate could ask of a recording."""
+
+    BY_VPS = "by_vps"
+    """Gyroscope by the VPS's attitude, vector triads by the trajectory."""
+    FREE = "free"
+    """Everything by vectors."""
+    HELD = "held"
+    """The accelerometer's constants held at those known beforehand."""
+    INERTIAL_START = "inertial_start"
+    """From attitudes by accelerometer and gyroscope alone."""
+    ZEROS = "zeros"
+    """The gyroscope's scales held too: its zero alone."""
 
 
 class Method(StrEnum):

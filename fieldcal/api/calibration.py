@@ -18,7 +18,7 @@ from fieldcal.exports.calibration import Constants
 from fieldcal.flight.calibrate import CalibratedLog, LogRead, identify, overruled, read, run_stages
 from fieldcal.flight.rows import rows_frame
 from fieldcal.geometry import sensor_model
-from fieldcal.names import SENSORS, Json, exactness
+from fieldcal.names import SENSORS, Approach, Json, exactness
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.rows import FlightDocument, Refusable, SyncRow
 from fieldcal.stages.tables import matrix, seconds
@@ -288,7 +288,7 @@ def calibrate(
     ----------
     log : Recording, Path or str
         A recording, or the path of a log as `read_log` takes it.
-    method : {"serial", "joint"}, optional
+    method : {"auto", "serial", "joint"}, optional
         One step after the other, or all triads and the attitude in one likelihood; else what the configuration says.
     profile : {"full", "onboard", "paper"}, optional
         Presets of the stages.
@@ -331,8 +331,8 @@ def calibrate(
     >>> calibration.gyroscope.scale.unit
     'rad/s/counts'
     """
-    if method not in (None, "serial", "joint"):
-        raise ValueError(f'method is "serial" or "joint", not {method!r}')
+    if method not in (None, *Approach):
+        raise ValueError(f"method is one of {', '.join(Approach)}, not {method!r}")
     changes = {name: _text(value) for name, value in (parameters or {}).items()}
     if isinstance(log, Recording):
         own = as_recording(log, config, vehicle).source

@@ -18,7 +18,7 @@ from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Method, Sensor
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.stages.joint import judged, triad_of
+from fieldcal.stages.joint.judgement import judged, triad_of
 from fieldcal.stages.results import triad_rows
 from fieldcal.stages.tables import calibration_rows
 

@@ -63,7 +63,7 @@ def calibrate(
     /,
     *,
     vehicle: str | None = None,
-    method: Literal["serial", "joint"] | None = None,
+    method: Literal["auto", "serial", "joint"] | None = None,
     profile: Literal["full", "onboard", "paper"] | None = None,
     set_: Annotated[list[str] | None, Parameter(name="--set")] = None,
     report: Annotated[Path | None, Parameter(help="Write the flight's report to this HTML file too.")] = None,

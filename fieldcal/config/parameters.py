@@ -7,7 +7,7 @@ from typing import TypeVar
 from pydantic import Field
 
 from fieldcal.config.values import Table
-from fieldcal.names import AttitudeFit, EllipsoidFit, Equations, InitialAttitude, ProfileName, SegmentEnds
+from fieldcal.names import AttitudeFit, EllipsoidFit, Equations, InitialAttitude, ProfileName, SegmentEnds, UseVps
 
 Value = float | str | bool
 V = TypeVar("V", bound=Value)
@@ -81,8 +81,25 @@ class Parameters(Table):
     gyro_max_scale_sd: float = parameter(
         0.05, "refuse above this relative standard deviation of a gyroscope scale", "1", within=(1e-4, 1.0)
     )
+    # joint estimate: what is known of a sensor before the first sample, where its unit or nominal scale is
+    prior_scale_sd: float = parameter(
+        0.03, "joint: sd of a scale about the nominal one, before the flight", "1", within=(1e-4, 1.0)
+    )
+    prior_magnetometer_scale_sd: float = parameter(
+        0.10, "joint: sd of what the magnetometer's scales have in common", "1", within=(1e-4, 1.0)
+    )
+    prior_gyroscope_zero_dps: float = parameter(2.0, "joint: sd of a gyroscope's zero", "deg/s", within=(1e-3, 100.0))
+    prior_accelerometer_zero_mps2: float = parameter(
+        0.3, "joint: sd of an accelerometer's zero", "m/s^2", within=(1e-3, 20.0)
+    )
+    prior_magnetometer_zero: float = parameter(
+        0.5, "joint: sd of a magnetometer's zero, as a share of the local field", "1", within=(1e-3, 20.0)
+    )
     # visual positioning system
-    use_vps: bool = parameter(False, "use the VPS attitude in the estimate (method joint)")
+    use_vps: UseVps = parameter(
+        "auto",
+        'VPS in the estimate (method joint): "auto" and true use one that can be used, true tells where there is none',
+    )
     vps_max_lag_s: float = parameter(60.0, "largest clock offset searched", "s", within=(0.1, 1e6))
     vps_min_peak: float = parameter(0.5, "refuse a correlation peak below this", "1", within=(0.0, 1.0))
     vps_max_gap_s: float = parameter(

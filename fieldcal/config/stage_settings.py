@@ -25,6 +25,7 @@ from fieldcal.names import (
     Sensor,
     Signs,
     Triple,
+    UseVps,
 )
 
 # --- what several stages have in common
@@ -255,7 +256,7 @@ class WarmUpSettings(Units):
 class VpsReference(Axes, VpsAttitude, VpsClock):
     """The VPS as a measurement of the joint estimate."""
 
-    use_vps: bool
+    use_vps: UseVps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,6 +268,11 @@ class JointSettings(LoggedValues, ReferenceReading, LocalField, Gravity, Gravity
     ellipsoid_max_scale_sd: float
     ellipsoid_max_residual: float
     gyro_max_scale_sd: float
+    prior_scale_sd: float
+    prior_magnetometer_scale_sd: float
+    prior_gyroscope_zero_dps: float
+    prior_accelerometer_zero_mps2: float
+    prior_magnetometer_zero: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -280,6 +286,13 @@ class VerifySettings(BodyVectors, Gravity, SmoothingSettings, Differentiation):
 
     attitude: AttitudeFit
     initial_attitude: InitialAttitude
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChoiceSettings(Axes):
+    """Stage `choice`."""
+
+    method: Mapping[Sensor, Approach]
 
 
 # --- from a flight's settings, and to and from the plain JSON of a record

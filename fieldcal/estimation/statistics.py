@@ -99,6 +99,13 @@ def independent_samples(residual: ArrayLike) -> float:
     return _coloured(np.zeros((len(r), 1, 0)), r[:, None])[1]
 
 
+def colour(residual: ArrayLike) -> float:
+    """How many times the density of white noise of the same variance the residuals (n, c), in order of time, have at
+    low frequency; mean of the channels, 1 at least."""
+    r = np.asarray(residual, dtype=float)
+    return float(np.mean([len(r) / max(independent_samples(column), 1e-9) for column in r.T]))
+
+
 def least_squares_covariance(sensitivity: ArrayLike, residual: ArrayLike, *, nuisance: int = 0) -> tuple[Array, Array]:
     """Covariances of a least-squares fit: (Cramér–Rao σ²M⁻¹, coloured M⁻¹[ΣΣ Sᵀ𝓡S]M⁻¹), each (p, p).
 

@@ -159,9 +159,11 @@ def signals(r: SimulatedFlight) -> dict[str, pl.DataFrame]:
 
 
 def settings(e: Experiment, vehicle_id: str = "sim-1", **changes: object) -> FlightSettings:
-    """Flight settings of a simulated vehicle, as its fieldcal.toml gives them; `changes` replace parameters."""
+    """Flight settings of a simulated vehicle, as its fieldcal.toml gives them, but for method serial, whose stages are
+    what most look at; `changes` replace parameters."""
     vehicle = parse(_vehicle_table(vehicle_id, e), None).vehicle(vehicle_id)
-    return flight_settings(vehicle, units=dict.fromkeys(SENSORS, "counts")).changed(**changes)
+    own = flight_settings(vehicle, units=dict.fromkeys(SENSORS, "counts"))
+    return own.changed(**{"method": "serial", **changes})
 
 
 def _write_mcap(path: Path, r: SimulatedFlight, t_ns: np.ndarray, vps_ns: np.ndarray, start_ns: int) -> None:

@@ -14,6 +14,7 @@ from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.config.stage_settings import (
     AccelerometerSettings,
     AttitudeSettings,
+    ChoiceSettings,
     GatedAccelerometerSettings,
     GyroEquationPass2Settings,
     GyroEquationSettings,
@@ -30,8 +31,19 @@ from fieldcal.config.stage_settings import (
     WarmUpSettings,
 )
 from fieldcal.names import VECTOR_SENSORS, Sensor
-from fieldcal.stages import attitude, comparison, gyroscope, joint, preparation, sanity, vector_triads, vps, warm_up
+from fieldcal.stages import (
+    attitude,
+    choice,
+    comparison,
+    gyroscope,
+    preparation,
+    sanity,
+    vector_triads,
+    vps,
+    warm_up,
+)
 from fieldcal.stages.inputs import Tables
+from fieldcal.stages.joint import estimate
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.stage import Stage, run_stage
 
@@ -208,7 +220,7 @@ PIPELINE: tuple[Stage, ...] = (
     ),
     _stage(
         "joint",
-        joint.estimate_jointly,
+        estimate.estimate_jointly,
         JointSettings,
         {
             **TRIAD,
@@ -221,7 +233,7 @@ PIPELINE: tuple[Stage, ...] = (
             "motor_faults": "vectors.faults",
         },
         (),
-        ("calibration", "covariance", "trajectory", "held_out"),
+        ("calibration", "covariance", "trajectory", "held_out", "faults"),
     ),
     _stage(
         "vps_sync",
@@ -260,16 +272,27 @@ PIPELINE: tuple[Stage, ...] = (
         ("samples",),
         ("fit",),
     ),
+    _stage(
+        "choice",
+        choice.choose,
+        ChoiceSettings,
+        {
+            **SAMPLES,
+            "vectors": "vectors.calibration",
+            "gyroscope": "gyro_output.calibration",  # equation error's rows too
+            "joint": "joint.calibration",
+            "joint_faults": "joint.faults",
+            "vps_aligned": "vps_sync.vps_aligned",
+            "fit": "verify.fit",
+        },
+        (),
+        ("calibration",),
+    ),
 )
 
 # The stages' tables that each published table is made of.
 PUBLISHED: dict[str, tuple[str, ...]] = {
-    "calibration": (
-        "vectors.calibration",
-        "gyro_output.calibration",  # equation error's rows too
-        "joint.calibration",
-        "warm_up.calibration",
-    ),
+    "calibration": ("choice.calibration", "warm_up.calibration"),
     "fit": ("verify.fit",),
     "sync": ("vps_sync.sync",),
 }

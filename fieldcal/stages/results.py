@@ -80,13 +80,15 @@ def triad_rows(
     reference_reading: ArrayLike,
     temperature_degc: float | None,
     reason_code: Sequence[ReasonCode | None] = (None, None, None),
+    zero_reason_code: Sequence[ReasonCode | None] | None = None,
     cross_sd: Array | None = None,
 ) -> list[CalibrationRow]:
     """Rows scale, bias, zero and zero_bias of one triad with their standard deviations.
 
     `scale` (3, 3), `bias` (3,), `covariance` (6, 6) of (λx, λy, λz, bx, by, bz). zero = −b/λ in logged units;
     zero_bias = λ d0 + b at `reference_reading` d0 (3,). Off-diagonal scales (full form) have the sd
-    of `cross_sd` (3, 3), if any.
+    of `cross_sd` (3, 3), if any. An axis with a reason code is refused; `zero_reason_code` where bias, zero and
+    zero_bias have others than the scale.
     """
     matrix, b, d0 = (np.asarray(v, dtype=float) for v in (scale, bias, reference_reading))
     divisor = f"({logged_unit})" if "/" in logged_unit else logged_unit
@@ -94,6 +96,7 @@ def triad_rows(
     rows: list[CalibrationRow] = []
 
     def add(parameter: str, axis: str, i: int, value: float, variance: float | None, row_unit: str) -> None:
+        code = (reason_code if parameter == "scale" or zero_reason_code is None else zero_reason_code)[i]
         finite = variance is not None and np.isfinite(variance) and variance >= 0
         rows.append(
             {
@@ -105,8 +108,8 @@ def triad_rows(
                 "sd": float(np.sqrt(variance)) if finite and variance is not None else None,
                 "unit": row_unit,
                 "temperature_degc": temperature_degc,
-                "status": Status.REFUSED if reason_code[i] else Status.OK,
-                "reason_code": reason_code[i],
+                "status": Status.REFUSED if code else Status.OK,
+                "reason_code": code,
             }
         )
 

@@ -99,9 +99,9 @@ def constants(
     if rows.is_empty() or (not refused_too and (rows["status"] != Status.OK).any()):
         return None
     value = {(p, a): v for p, a, v in rows.select("parameter", "axis", "value").iter_rows()}
-    bias = np.array([value["bias", a] for a in AXES])
+    bias = np.array([value["bias", a] for a in AXES], dtype=float)
     if ("scale", "xy") in value:
-        scale = np.array([[value["scale", r + c] for c in AXES] for r in AXES])
+        scale = np.array([[value["scale", r + c] for c in AXES] for r in AXES], dtype=float)
     else:
-        scale = np.diag([value["scale", a] for a in AXES])
+        scale = np.diag(np.array([value["scale", a] for a in AXES], dtype=float))
     return scale, bias

@@ -22,6 +22,8 @@ METHODS = ("serial", "joint")
 CHOICES: tuple[dict[str, Any], ...] = (
     *({"method": dict(zip(SENSORS, mixture, strict=True))} for mixture in itertools.product(METHODS, repeat=3)),
     {"method": "joint", "parameters": {"use_vps": True}},
+    {"method": "joint", "parameters": {"use_vps": False}},
+    {"method": "auto"},
     {"profile": "onboard"},
     {"profile": "paper"},
 )
@@ -69,7 +71,7 @@ def expected_methods(choice: dict[str, Any], sensor: str) -> set[str]:
 
 def joint_for(choice: dict[str, Any], sensor: str) -> bool:
     method = choice.get("method", "serial")
-    return (method if isinstance(method, str) else method[sensor]) == "joint"
+    return (method if isinstance(method, str) else method[sensor]) in ("joint", "auto")
 
 
 @pytest.mark.parametrize("number", range(1, len(CHOICES) + 1))

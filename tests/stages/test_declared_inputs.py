@@ -109,6 +109,9 @@ def asked() -> dict[str, set[str]]:
     flights = [
         (with_power(tables), chosen),
         (tables, chosen.changed(method="joint", use_vps=True)),
+        (tables, chosen.changed(method="joint", use_vps=False)),
+        (si_tables, si.changed(method="joint", use_vps=False)),
+        (tables, chosen.changed(method="auto")),
         (tables, chosen.changed(**PROFILES["paper"])),
         (tables, chosen.changed(**PROFILES["onboard"])),
         (tables, chosen.changed(lever_arm_m=(0.05, 0.02, -0.03))),

@@ -19,7 +19,9 @@ LAG_S = 0.4e-3
 
 
 def flown(r: SimulatedFlight, **changes: Any) -> dict[str, StageResult]:
-    return run_flight(signals(r), settings(r.experiment, method="joint", lever_arm_m=None, **changes))
+    return run_flight(
+        signals(r), settings(r.experiment, **{"method": "joint", "lever_arm_m": None, "use_vps": False, **changes})
+    )
 
 
 @pytest.fixture(scope="module")
@@ -127,12 +129,12 @@ def test_one_sensor_alone_may_be_joint() -> None:
     r = simulate(seed=35, duration_s=20.0, sets=2)
     whole = flown(r)
     method = {"magnetometer": "serial", "accelerometer": "serial", "gyroscope": "joint"}
-    results = run_flight(signals(r), settings(r.experiment, method=method, lever_arm_m=None))
+    results = run_flight(signals(r), settings(r.experiment, method=method, lever_arm_m=None, use_vps=False))
     rows = results["joint"].tables["calibration"]
     assert set(rows["sensor"]) == {"gyroscope"}
     assert rows.equals(whole["joint"].tables["calibration"].filter(sensor="gyroscope"))
     method = {"magnetometer": "joint", "accelerometer": "joint", "gyroscope": "serial"}
-    results = run_flight(signals(r), settings(r.experiment, method=method, lever_arm_m=None))
+    results = run_flight(signals(r), settings(r.experiment, method=method, lever_arm_m=None, use_vps=False))
     assert set(results["joint"].tables["calibration"]["sensor"]) == {"magnetometer", "accelerometer"}
     assert "held_out" not in results["joint"].tables
     assert "joint" not in results["verify"].tables["fit"].filter(quantity="body_rate")["method"].to_list()

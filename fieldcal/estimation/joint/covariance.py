@@ -68,9 +68,8 @@ def covariance(
         between = (1.0 - share) * response[knot][:, SENSED] + share * response[after][:, SENSED]
         root = np.sqrt(whitening[rows.span])
         seen = (rows.by_parameter - rows.by_knot @ between) * root[..., None]
-        sensitivity[knot_span, :r] = sums_by_interval(model, seen.reshape(len(at), -1), rows.span, knot_span).reshape(
-            -1, r, p
-        )
+        by_interval = sums_by_interval(model, seen.reshape(len(at), r * p), rows.span, knot_span)
+        sensitivity[knot_span, :r] = by_interval.reshape(len(by_interval), r, p)
         sensitivity[knot_span, r:] += ends
         left = rows.residual * root
         residual[knot_span, :r] = sums_by_interval(model, left, rows.span, knot_span)

@@ -10,7 +10,7 @@ translation) are estimated at the same time as variance components, so nothing h
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,9 +43,11 @@ from fieldcal.estimation.joint.measurement_model import (
     trajectory,
 )
 from fieldcal.estimation.joint.pose_measurement import VpsRecord
-from fieldcal.estimation.joint.problem import CROSS, TRIADS, Model, State, off_diagonal
+from fieldcal.estimation.joint.problem import CROSS, TRIADS, Model, PriorConstants, State, off_diagonal
 from fieldcal.estimation.joint.score_corrections import logged_units, within_intervals
 from fieldcal.estimation.joint.variance_components import (
+    CHANCE_COLOUR_RATIO,
+    LARGEST_WALK_RATIO,
     Levels,
     first_levels,
     gyro_walk,
@@ -53,6 +55,7 @@ from fieldcal.estimation.joint.variance_components import (
     passing_fields,
     renewed_levels,
     robust_weight,
+    slow_colour,
 )
 from fieldcal.estimation.statistics import white_noise_sigma
 from fieldcal.geometry.rotation import Array
@@ -79,6 +82,19 @@ OTHER_PRIOR_SD = 1.0  # of all other parameters, each in its unit: rad of dip, m
 
 
 @dataclass(frozen=True)
+class Options:
+    """What a fit is made with: a free `dip`, a free `lever_arm`, a VPS, a bound of the walk, `priors` by sensor,
+    and colour of the rows over seconds (`slow`)."""
+
+    dip: bool = True
+    lever_arm: bool = True
+    vps: VpsRecord | None = None
+    walk_ratio: float = LARGEST_WALK_RATIO
+    priors: Mapping[str, PriorConstants] = field(default_factory=dict)
+    slow: bool = False
+
+
+@dataclass(frozen=True)
 class JointFit:
     """The solution in centred coordinates; θ is ordered by `layout`.
 
@@ -99,6 +115,12 @@ class JointFit:
     bias_walk: float = 0.0
     lever_arm_test: float | None = None
     vps: VpsRecord | None = None
+    options: Options = Options()
+
+    @property
+    def priors(self) -> Mapping[str, PriorConstants]:
+        """What was known beforehand, by sensor."""
+        return self.options.priors
 
     def constants(self, name: str) -> tuple[Array, Array, Array]:
         """(λ (3,), b (3,), covariance (6, 6)) of a triad without cross-axis terms, logged units."""
@@ -131,6 +153,8 @@ def fit_joint(
     try_lever_arm: bool = True,
     vps: VpsRecord | None = None,
     levels: Levels | None = None,
+    largest_walk_ratio: float = LARGEST_WALK_RATIO,
+    priors: Mapping[str, PriorConstants] | None = None,
 ) -> JointFit:
     """Estimate all constants, attitudes and noise levels from a start within some tens of per cent.
 
@@ -150,6 +174,10 @@ def fit_joint(
         Reference attitudes; `start` then holds `VpsRecord.start()` too.
     levels : Levels, optional
         Noise to start from, that of a similar fit.
+    largest_walk_ratio : float
+        Most that the attitude's walk may be over that by the gyroscope's sample-to-sample noise.
+    priors : mapping, optional
+        Sensor → what is known of its constants before the first sample; of the others nearly nothing is.
 
     Raises
     ------
@@ -167,29 +195,62 @@ def fit_joint(
     vehicle other than hard iron.
     """
     free = try_lever_arm and "accelerometer" in model.vectors
-    fit, response = _iterate(model, start, levels, 0, dip=free_dip, lever_arm=free, vps=vps)
+    how = Options(free_dip, free, vps, largest_walk_ratio, priors or {})
+    try:
+        fit, response = _iterate(model, start, levels, 0, how)
+    except EstimationError:
+        # Rows that are correlated over seconds may have counted for too much.
+        if not model.vectors:
+            raise
+        how = replace(how, slow=True)
+        fit, response = _iterate(model, start, levels, 0, how)
     for _ in range(BURST_ROUNDS):
         passing = passing_fields(fit.model, fit.weight)
         if not passing.any():
             break
         model = fit.model.without("magnetometer", passing)
-        fit, response = _iterate(model, fit.state, fit.levels, fit.iterations, dip=free_dip, lever_arm=free, vps=vps)
+        fit, response = _iterate(model, fit.state, fit.levels, fit.iterations, how)
+    if model.vectors and not how.slow and _is_slow(fit):
+        how = replace(how, slow=True)
+        fit, response = _iterate(fit.model, fit.state, fit.levels, fit.iterations, how)
     if not free:
         return _enlarged(fit, response)
     test = _lever_arm_test(fit)
     if test >= LEVER_ARM_CHI2:  # the coloured covariance can only make it smaller
         fit = _enlarged(fit, response)
         test = _lever_arm_test(fit)
+    without = _enlarged(*_without_lever_arm(fit, response, how))
     if test < LEVER_ARM_CHI2:
-        columns = fit.layout["lever_arm"]
-        # The state given a lever arm of zero: every other parameter follows by its covariance with the lever arm.
-        to_zero = np.linalg.solve(fit.covariance[columns, columns], fit.state.values["lever_arm"])
-        change = fit.covariance[:, columns] @ to_zero
-        without = fit.state.moved(response @ change, -change, fit.layout)
-        without = replace(without, values={**without.values, "lever_arm": np.zeros(3)})
-        fit, response = _iterate(fit.model, without, fit.levels, fit.iterations, dip=free_dip, lever_arm=False, vps=vps)
-        fit = _enlarged(fit, response)
-    return replace(fit, lever_arm_test=test)
+        return replace(without, lever_arm_test=test)
+    return replace(_or_without_arm(fit, without), lever_arm_test=test)
+
+
+def _is_slow(fit: JointFit) -> bool:
+    """Whether the rows are correlated over seconds."""
+    residual = residuals(fit.model, fit.state, fit.path)
+    slow = slow_colour(fit.model, residual, fit.weight)
+    return bool(np.any(slow > CHANCE_COLOUR_RATIO * fit.levels.colour))
+
+
+def _without_lever_arm(fit: JointFit, response: Array, how: Options) -> tuple[JointFit, Array]:
+    """The fit with a lever arm of zero: every other parameter starts where its covariance with the lever arm says."""
+    columns = fit.layout["lever_arm"]
+    to_zero = np.linalg.solve(fit.covariance[columns, columns], fit.state.values["lever_arm"])
+    change = fit.covariance[:, columns] @ to_zero
+    without = fit.state.moved(response @ change, -change, fit.layout)
+    without = replace(without, values={**without.values, "lever_arm": np.zeros(3)})
+    return _iterate(fit.model, without, fit.levels, fit.iterations, replace(how, lever_arm=False))
+
+
+def _or_without_arm(fit: JointFit, without: JointFit) -> JointFit:
+    """The fit, half of what a lever arm changes of the accelerometer's constants in their sd: a hand that turns an IMU
+    has a pivot, which passes every test that an arm of the sensor passes (it explains a third of the acceleration, as
+    an arm on a vehicle does) but is not as constant."""
+    columns = fit.layout["accelerometer"]
+    change = 0.5 * (fit.state.values["accelerometer"] - without.state.values["accelerometer"])
+    covariance = fit.covariance.copy()
+    covariance[columns, columns] += np.outer(change, change)
+    return replace(fit, covariance=covariance)
 
 
 def _lever_arm_test(fit: JointFit) -> float:
@@ -215,20 +276,18 @@ def _enlarged(fit: JointFit, response: Array) -> JointFit:
     return replace(fit, covariance=enlarged, bias_walk=walk)
 
 
-def _iterate(
-    model: Model, state: State, levels: Levels | None, spent: int, *, dip: bool, lever_arm: bool, vps: VpsRecord | None
-) -> tuple[JointFit, Array]:
+def _iterate(model: Model, state: State, levels: Levels | None, spent: int, how: Options) -> tuple[JointFit, Array]:
     """Gauss–Newton with noise levels estimated anew at every step: the fit with the inverse information as covariance,
     and the knots' response N_xx⁻¹N_xθ. `spent` iterations are counted on top."""
-    layout, p = layout_of(model, state.values, dip=dip, lever_arm=lever_arm)
-    knots, prior = model.knots, _Prior.at(model, state, layout, p)
+    layout, p = layout_of(model, state.values, dip=how.dip, lever_arm=how.lever_arm)
+    knots, prior, vps = model.knots, _Prior.at(model, state, layout, p, how.priors), how.vps
     probe = Probe.draw(knots, model.readings.t, model.at, 3 * len(model.vectors))
     path = trajectory(model, state)
     residual = residuals(model, state, path)
     levels = levels or first_levels(model, state, path, residual)
     previous: Array = np.zeros(p)
     for iteration in range(1, MAX_ITERATIONS + 1):
-        if iteration == RESTART_AFTER_ITERATIONS:
+        if iteration == RESTART_AFTER_ITERATIONS and model.vectors:
             state = initialise.anew(model, state)
             path = trajectory(model, state)
             residual = residuals(model, state, path)
@@ -259,13 +318,17 @@ def _iterate(
         absorbed = np.einsum("kcr,kc->r", at_knots, response[:, SENSED, SENSORS]) + at_parameters.T @ theta[:, SENSORS]
         joints = replace(joints, jump=path.jump, motion=state.motion)
         squares = joint_squares(knots, joints, response, theta, probe)
-        renewed = renewed_levels(model, residual, levels, absorbed, squares, gyro_walk(model, state))
+        renewed = renewed_levels(
+            model, residual, levels, absorbed, squares, how.walk_ratio * gyro_walk(model, state), slow=how.slow
+        )
         level_change, levels = largest_level_change(levels, renewed, squares), renewed
         sd = 1.0 / np.sqrt(np.diagonal(information))
         converged = max(level_change, float(np.max(np.abs(change) / sd))) < CONVERGED_STEP_SD
         if converged or float(np.max(np.abs(change))) < SMALLEST_STEP:
             plain = inverse_information(information)
-            fit = JointFit(model, state, path, levels, weight, layout, plain, information, spent + iteration, vps=vps)
+            fit = JointFit(
+                model, state, path, levels, weight, layout, plain, information, spent + iteration, vps=vps, options=how
+            )
             return fit, eliminated[:, :, :p]
     raise _no_minimum(model, iteration)
 
@@ -327,13 +390,16 @@ def _whitening(weight: Array, levels: Levels) -> Array:
 
 @dataclass(frozen=True)
 class _Prior:
-    """Weak prior on the constants, which keeps directions that the record does not determine at their start."""
+    """What is known beforehand, which keeps directions that the record does not determine: `mean` (p,), `information`
+    (p, p)."""
 
     mean: Array
     information: Array
 
     @classmethod
-    def at(cls, model: Model, state: State, layout: Mapping[str, slice], p: int) -> _Prior:
+    def at(
+        cls, model: Model, state: State, layout: Mapping[str, slice], p: int, priors: Mapping[str, PriorConstants]
+    ) -> _Prior:
         mean, sd = np.zeros(p), np.full(p, OTHER_PRIOR_SD)
         for name, columns in layout.items():
             mean[columns] = state.values[name]
@@ -341,12 +407,18 @@ class _Prior:
                 sd[columns] = PRIOR_RELATIVE_SD * np.tile(np.abs(state.values[name][:3]), 2)
         if "lever_arm" in layout:
             mean[layout["lever_arm"]] = 0.0
-        return cls(mean, 1.0 / sd**2)
+        information = np.diag(1.0 / sd**2)
+        for name, known in priors.items():
+            if name in layout:
+                columns, transform = layout[name], model.triads[name].to_logged()
+                mean[columns] = model.triads[name].scaled(known.scale, known.bias)
+                information[columns, columns] = transform.T @ np.linalg.inv(known.covariance) @ transform
+        return cls(mean, information)
 
     def add(self, normal: Normal, state: State, layout: Mapping[str, slice]) -> None:
         now = np.concatenate([state.values[name] for name in layout])
-        normal.parameters[np.diag_indices(len(now))] += self.information
-        normal.parameters_right[:, 0] += self.information * (self.mean - now)
+        normal.parameters += self.information
+        normal.parameters_right[:, GRADIENT] += self.information @ (self.mean - now)
 
 
 def _step_share(state: State, step: Array, theta: Array, layout: Mapping[str, slice]) -> float:

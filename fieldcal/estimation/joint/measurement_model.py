@@ -192,13 +192,11 @@ def sensitivities(
             by_knot[:, row, :3] = gain * (turn @ skew(vector))
             by_parameter[:, row, by_gyroscope] = by_knot[:, row, :3] @ moved
             column = layout[name].start
-            # The translation is correlated with the residuals and would bias λ: gravity and lever arm alone determine
-            # it.
+            # Translation and the lever arm's part are noise to the scale, and a noisy regressor would bias it: gravity
+            # alone determines it.
             steady = sensed
             if name == "accelerometer":
-                steady = sensed + np.sign(model.readings.gravity_mps2) * np.einsum(
-                    "nij,nj->ni", turn, translation(model, state, span)
-                )
+                steady = model.readings.gravity_mps2 * turn[:, :, 2]
             for axis in range(3):
                 scaled = (steady[:, axis] - constants[3 + axis]) / constants[axis]
                 by_parameter[:, 3 * i + axis, column + axis] = -valid * scaled / constants[axis]
@@ -290,9 +288,9 @@ def accumulate(
     by_interval = np.take(columns, _padded(model, rows.span, knot_span), axis=0)  # (knots, most rows, r, 18 + p)
     by_row = by_interval.transpose(0, 2, 3, 1)
     alone, together = (by_row[:, :, :12] @ by_row[:, :, 16 + p :].transpose(0, 1, 3, 2)).transpose(3, 0, 2, 1)
-    by_interval = by_interval.reshape(knot_span.stop - knot_span.start, -1, 18 + p)
+    by_interval = by_interval.reshape(len(by_interval), by_interval.shape[1] * r, 18 + p)
     product = by_interval[..., :12].transpose(0, 2, 1) @ by_interval[..., : 16 + p]  # (knots, 12, 16 + p)
-    flat = columns[:m].reshape(m * r, -1)[:, 12 : 16 + p]
+    flat = columns[:m].reshape(m * r, columns.shape[2])[:, 12 : 16 + p]
     total = flat.T @ flat
     by_signs = (others[..., :p].transpose(1, 2, 0) @ probes_of_row[..., :1].transpose(1, 0, 2))[..., 0].T
     normal.parameters += total[:p, :p]

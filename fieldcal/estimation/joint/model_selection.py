@@ -47,7 +47,7 @@ class TermTest:
 
 def add_terms(fit: JointFit) -> tuple[JointFit, list[TermTest]]:
     """The fit with the optional terms that pass both tests, and the result of the tests."""
-    scores = _scores(fit)
+    scores = _scores(fit) if candidates(fit) else {}
     over = {name: score / SCORE_CHI2[TERMS[name]] for name, score in scores.items()}
     tried = sorted((name for name in over if over[name] > 1.0), key=lambda name: -over[name])
     gains = _gains(fit, tried) if tried else {}
@@ -69,7 +69,7 @@ def with_terms(fit: JointFit, names: list[str]) -> JointFit:
 def candidates(fit: JointFit) -> list[str]:
     """Terms that this record could determine at all."""
     readings = fit.model.readings
-    out = ["gyroscope_cross"] if len(fit.model.vectors) == 2 or fit.vps is not None else []
+    out = ["gyroscope_cross"] if len(fit.model.vectors) == 2 else []
     if readings.warmth is not None and float(np.ptp(readings.warmth)) > LEAST_TEMPERATURE_RANGE_DEGC:
         out.append("gyroscope_temperature")
     if float(np.sqrt(np.mean(np.sum(fit.path.rate**2, axis=1)))) > LEAST_RATE_RADPS:
@@ -85,8 +85,16 @@ def with_zeros(state: State, names: list[str]) -> State:
 def _refitted(
     model: Model, state: State, levels: Levels, like: JointFit, names: list[str], vps: VpsRecord | None
 ) -> JointFit:
-    free = {"free_dip": "dip" in like.layout, "try_lever_arm": "lever_arm" in like.layout}
-    return fit_joint(model, with_zeros(state, names), vps=vps, levels=levels, **free)
+    return fit_joint(
+        model,
+        with_zeros(state, names),
+        free_dip="dip" in like.layout,
+        try_lever_arm="lever_arm" in like.layout,
+        vps=vps,
+        levels=levels,
+        largest_walk_ratio=like.options.walk_ratio,
+        priors=like.priors,
+    )
 
 
 def _scores(fit: JointFit) -> dict[str, float]:

@@ -112,6 +112,16 @@ class VpsRecord:
         """Estimated rotation (4,) between the VPS's body axes and the triads'."""
         return multiply(self.body, from_rotation_vector(values["vps_body"]))
 
+    def world_rotation(self, values: Mapping[str, Array]) -> Array:
+        """Estimated rotation (4,) from the VPS's world to the fit's."""
+        return multiply(from_rotation_vector(values["vps_world"]), self.world)
+
+    def to_imu_clock(self, t: Array, values: Mapping[str, Array]) -> Array:
+        """VPS stamps, s, on the IMU's clock."""
+        lag, skew = self.clock_of(values)
+        middle = self.clock.reference_s
+        return np.asarray((t + lag - middle) / (1.0 + skew) + middle)
+
     def _read(self, model: Model, correction: Array) -> tuple[Array, np.ndarray]:
         """VPS attitude at the knots (K, 4), and which of them lie between poses no more than `max_gap_s` apart."""
         lag, skew = self.clock_of({"vps_clock": correction})
@@ -124,7 +134,7 @@ class VpsRecord:
     def residual(self, model: Model, state: State) -> tuple[Array, np.ndarray]:
         """VPS less estimate (K, 3), rad, inertial axes; and which knots count (K,)."""
         q, available = self._read(model, state.values["vps_clock"])
-        world = multiply(from_rotation_vector(state.values["vps_world"]), self.world)
+        world = self.world_rotation(state.values)
         body = self.mounting(state.values)
         error = to_rotation_vector(multiply(multiply(multiply(world, q), body), conjugate(state.q)))
         return error, available & self.used

@@ -67,6 +67,19 @@ class Readings:
             warmth=cut(self.warmth),
         )
 
+    def gyroscope_alone(self) -> Readings:
+        """Without the vector triads."""
+        return replace(self, accelerometer=None, magnetometer=None)
+
+
+@dataclass(frozen=True)
+class PriorConstants:
+    """What is known of a triad beforehand, logged units: `scale` (3,), `bias` (3,), `covariance` (6, 6) of both."""
+
+    scale: Array
+    bias: Array
+    covariance: Array
+
 
 def averaging_side(readings: Readings, rate_radps: float) -> int:
     """How many neighbours on either side a vector reading may be averaged with: while the vehicle turns by less than
@@ -157,7 +170,12 @@ class Model:
             [np.arange(a + side, b - side, 2 * side + 1) for a, b in run_bounds(readings.segment) if b - a > 2 * side]
         )
         triads = {name: x.averaged(at, side) if name in vectors else x for name, x in triads.items()}
-        return cls(readings, triads, knots, vectors, at)
+        # Nothing is compared at the rows of a model without vectors: one an interval will do.
+        return cls(readings, triads, knots, vectors, at if vectors else knots.index)
+
+    def valid_rows(self) -> np.ndarray:
+        """Which vector triads have a reading at each row, (m, vectors) bool."""
+        return np.array([self.triads[name].valid for name in self.vectors], dtype=bool).reshape(-1, len(self.at)).T
 
     def part(self, a: int, b: int, knots: Knots) -> Model:
         """Samples a to b alone, in the same centred units, with `knots` placed on them."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
 from fieldcal.estimation.joint.measurement_model import Trajectory
@@ -31,21 +32,29 @@ LEAST_ACCELERATION_MPS2, LEAST_WALK, LEAST_VARIANCE = 2e-3, 1e-9, 1e-8
 SMALLEST_STEP_RATIO, LARGEST_STEP_RATIO = np.array([0.25, 0.01]), np.array([4.0, 10.0])
 
 
+# Longest correlation of a residual that its density takes in, s, and the largest density over that of white noise.
+COLOUR_S, LARGEST_COLOUR, LARGEST_COLOUR_WITHIN = 3.0, 400.0, 10.0
+# By chance correlation over so long a time makes a density seem so many times larger.
+CHANCE_COLOUR_RATIO = 1.5
+
+
 @dataclass(frozen=True)
 class Levels:
     """Noise levels: `variance` (r,) of each residual of a row, x²; `colour` (r,) its density at low frequency over that
-    of white noise of the same variance; `walk`, density of the attitude's random walk by gyroscope noise, rad²/s;
+    of white noise of the same variance, by correlation over seconds, and `colour_within` (r,) over half an interval;
+    `walk`, density of the attitude's random walk by gyroscope noise, rad²/s;
     `strength`, stationary rms of the translation's acceleration, m/s² an axis."""
 
     variance: Array
     colour: Array
+    colour_within: Array
     walk: float
     strength: float
 
 
 def first_levels(model: Model, state: State, path: Trajectory, residual: Array) -> Levels:
     """Levels to start from: those of the residuals at the start."""
-    valid = np.repeat(np.column_stack([model.triads[name].valid for name in model.vectors]), 3, axis=1)
+    valid = np.repeat(model.valid_rows(), 3, axis=1)
     sigma = np.array([robust_sigma(r[k]) for r, k in zip(residual.T, valid.T, strict=True)])
     variance = np.maximum(sigma**2, LEAST_VARIANCE)
     jumped = np.sum(path.jump**2) / (3.0 * np.sum(model.knots.interval_s * model.knots.joined))
@@ -54,7 +63,7 @@ def first_levels(model: Model, state: State, path: Trajectory, residual: Array) 
     if "accelerometer" in model.vectors:
         row = 3 * model.vectors.index("accelerometer")
         strength = max(strength, float(np.max(sigma[row : row + 3] * np.abs(state.values["accelerometer"][:3]))))
-    return Levels(variance, np.ones(len(variance)), walk, strength)
+    return Levels(variance, np.ones(len(variance)), np.ones(len(variance)), walk, strength)
 
 
 def gyro_walk(model: Model, state: State) -> float:
@@ -65,12 +74,13 @@ def gyro_walk(model: Model, state: State) -> float:
 
 
 def renewed_levels(
-    model: Model, residual: Array, levels: Levels, absorbed: Array, squares: Array, sensor_walk: float
+    model: Model, residual: Array, levels: Levels, absorbed: Array, squares: Array, largest_walk: float, *, slow: bool
 ) -> Levels:
     """Variance components: sums of squares over the degrees of freedom that the unknowns leave.
 
     `absorbed` (r,) degrees of freedom of each residual that the unknowns absorb, of white noise; `squares` (2, 3) of
-    the joints (`joint.chain_solver.joint_squares`); `sensor_walk` by `gyro_walk`."""
+    the joints (`joint.chain_solver.joint_squares`); `largest_walk`, rad²/s;
+    `slow`: colour over seconds too."""
     weight = robust_weight(model, residual, levels)
     count = weight.sum(axis=0)
     left = np.maximum(count - levels.colour * absorbed, 0.05 * count)
@@ -81,16 +91,14 @@ def renewed_levels(
     number = np.where(square < free, np.minimum(information, free), free)
     ratio = np.clip(1.0 + (square - free) / number, SMALLEST_STEP_RATIO, LARGEST_STEP_RATIO)
     walk, strength = levels.walk * ratio[0], levels.strength * np.sqrt(ratio[1])
+    within = colour_within(model, residual, weight)
     return Levels(
         variance,
-        _colour(model, residual, weight),
+        slow_colour(model, residual, weight) if slow else within,
+        within,
         # Attitudes that jump at the start are linked loosely first and more stiffly step by step: the linearisation
         # holds for small turns only.
-        float(
-            np.clip(
-                walk, LEAST_WALK, max(LARGEST_WALK_RATIO * sensor_walk, levels.walk / LARGEST_WALK_DROP, LEAST_WALK)
-            )
-        ),
+        float(np.clip(walk, LEAST_WALK, max(largest_walk, levels.walk / LARGEST_WALK_DROP, LEAST_WALK))),
         max(float(strength), LEAST_ACCELERATION_MPS2),
     )
 
@@ -119,7 +127,9 @@ def robust_weight(model: Model, residual: Array, levels: Levels) -> Array:
         square = np.sum(residual[:, row] ** 2 / levels.variance[row], axis=1)
         if name == "magnetometer":
             mean = uniform_filter1d(residual[:, row], together, axis=0)
-            square = np.maximum(square, np.sum(mean**2 * together / (levels.variance * levels.colour)[row], axis=1))
+            square = np.maximum(
+                square, np.sum(mean**2 * together / (levels.variance * levels.colour_within)[row], axis=1)
+            )
         weight = np.minimum(1.0, CLIP_SD**2 / np.maximum(square, 1e-12)) ** 2 * model.triads[name].valid
         out[:, row] = weight[:, None]
     return out
@@ -140,12 +150,24 @@ def passing_fields(model: Model, weight: Array) -> np.ndarray:
     return np.asarray(valid & (np.cumsum(change)[:-1] > 0))
 
 
-def _colour(model: Model, residual: Array, weight: Array) -> Array:
-    """Density at low frequency over that of white noise, (r,): from the autocorrelation within half an interval."""
+def colour_within(model: Model, residual: Array, weight: Array) -> Array:
+    """Density at low frequency over that of white noise, (r,): from the autocorrelation over half an interval."""
     lags = int(np.clip(len(residual) / len(model.knots.index) / 2, 1, 8))
-    x = residual * np.sqrt(weight)
-    zero = np.maximum(np.sum(x * x, axis=0), 1e-300)
-    colour = np.ones(x.shape[1])
-    for lag in range(1, lags + 1):
-        colour += 2.0 * (1.0 - lag / (lags + 1)) * np.sum(x[lag:] * x[:-lag], axis=0) / zero
-    return np.clip(np.repeat(colour.reshape(-1, 3).mean(axis=1), 3), 1.0, 10.0)
+    return _colour(residual * np.sqrt(weight), lags, LARGEST_COLOUR_WITHIN)
+
+
+def slow_colour(model: Model, residual: Array, weight: Array) -> Array:
+    """The same over COLOUR_S: a magnetometer's residual (soft iron, a room) is coloured over seconds."""
+    interval_s = float(np.sum(model.knots.interval_s * model.knots.joined)) / max(len(residual), 1)
+    lags = int(np.clip(COLOUR_S / interval_s, 1, max(len(residual) // 4, 1)))
+    return np.maximum(_colour(residual * np.sqrt(weight), lags, LARGEST_COLOUR), colour_within(model, residual, weight))
+
+
+def _colour(x: Array, lags: int, largest: float) -> Array:
+    """From the tapered autocorrelation of x (m, r), the axes of a triad together."""
+    size = fft.next_fast_len(len(x) + lags + 1, real=True)
+    correlation = fft.irfft(np.abs(fft.rfft(x, size, axis=0)) ** 2, size, axis=0)[: lags + 1]
+    by_triad = correlation.reshape(lags + 1, -1, 3).sum(axis=2)
+    taper = 1.0 - np.arange(1, lags + 1) / (lags + 1)
+    colour = 1.0 + 2.0 * (taper @ by_triad[1:]) / np.maximum(by_triad[0], 1e-300)
+    return np.repeat(np.clip(colour, 1.0, largest), 3)

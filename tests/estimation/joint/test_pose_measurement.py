@@ -64,12 +64,12 @@ def test_its_use_and_its_clock_are_told(flights: list[tuple[SimulatedFlight, dic
         assert set(fit["sample"]) == {"all", "held_out"}
 
 
-def test_without_use_vps_the_vps_changes_nothing() -> None:
+def test_a_vps_that_is_switched_off_changes_nothing() -> None:
     r = simulate(seed=44, duration_s=20.0, sets=1)
-    with_vps, frames = flown(r), signals(r)
+    with_vps, frames = flown(r, use_vps=False), signals(r)
     del frames["vps"]
     own = settings(r.experiment, method="joint", lever_arm_m=None)
-    for use_vps in (False, True):
+    for use_vps in ("auto", True, False):
         without = run_flight(frames, own.changed(use_vps=use_vps))["joint"].tables["calibration"]
         assert with_vps["joint"].tables["calibration"].equals(without)
 

@@ -87,7 +87,8 @@ class Flight:
         sigma |= {name: sigma[name] / np.sqrt(AVERAGED) for name in model.vectors}
         variance = np.concatenate([(sigma[name] / values[name][:3]) ** 2 for name in model.vectors])
         walk = sigma["gyroscope"] ** 2 / RATE_HZ
-        levels = Levels(variance, np.ones(len(variance)), walk, float(np.sqrt(np.mean(strength_mps2**2))))
+        white = np.ones(len(variance))
+        levels = Levels(variance, white, white, walk, float(np.sqrt(np.mean(strength_mps2**2))))
         return cls(model, state, levels, sigma, strength_mps2)
 
     def drawn(self, rng: np.random.Generator) -> list[tuple[Model, State]]:

@@ -1,0 +1,139 @@
+"""Which estimates of a flight count: between the methods for each sensor, and against the VPS."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from fieldcal.estimation.smoothing import low_pass
+from fieldcal.estimation.statistics import least_squares_covariance
+from fieldcal.geometry import sensor_model
+from fieldcal.geometry.rotation import Array
+from fieldcal.names import SENSORS, Approach, Json, Method, Sensor, Status
+from fieldcal.reason_codes import ReasonCode
+from fieldcal.stages.inputs import Tables
+from fieldcal.stages.results import StageResult, fatal_fault
+from fieldcal.stages.tables import AXES, calibration_rows, constants, matrix, seconds, triad
+from fieldcal.stages.vps import RATE_COLUMNS, bridged
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import ChoiceSettings
+
+# The joint estimate gives way only where its gyroscope drifts from the VPS by more than this times what the serial
+# chain's does.
+LARGEST_DRIFT_RATIO = 1.5
+# Scales against those that the VPS's rates show: so many sd off, and by at least this share, they contradict it.
+CONTRADICTED_SD, CONTRADICTED_SHARE = 5.0, 0.03
+# Low-pass of both sides' rates, Hz and s on either side: a VPS that smooths shows faster turns too small.
+CUTOFF_HZ, SIDE_S = 0.7, 4.0
+
+
+def choose(tables: Tables, s: ChoiceSettings) -> StageResult:
+    """Every method's constants, fit, VPS → calibration: all rows, those that do not count refused with the reason."""
+    parts = [tables[name] for name in ("vectors", "gyroscope", "joint") if name in tables]
+    if not parts:
+        return StageResult(
+            status=Status.REFUSED, reason_code=ReasonCode.NOTHING_CALIBRATED, reason="No method gave constants."
+        )
+    rows = pl.concat(parts)
+    measured: dict[str, Json] = {}
+    against = _contradicted(rows, tables, s)
+    measured["scale_by_vps"] = {method: [list(pair) for pair in pairs] for method, pairs in against.items()}
+    for method, pairs in against.items():
+        scales = rows.filter(sensor=Sensor.GYROSCOPE, method=method, parameter="scale", status=str(Status.OK))
+        published = set(scales["axis"].to_list())
+        axes = [axis for axis, (off, sd) in zip(AXES, pairs, strict=True) if _off(off, sd) and axis in published]
+        if axes:
+            rows = _refused(rows, Sensor.GYROSCOPE, [method], axes, ReasonCode.VPS_CONTRADICTS)
+    chosen: dict[str, Json] = {}
+    for sensor in SENSORS:
+        if s.method[sensor] != Approach.AUTO:
+            continue
+        own = rows.filter(sensor=sensor)
+        methods = own["method"].unique().to_list()
+        if Method.JOINT not in methods:
+            chosen[sensor] = Approach.SERIAL
+            fault = fatal_fault(tables["joint_faults"], (sensor,)) if "joint_faults" in tables else None
+            if fault is not None:
+                rows = _refused(rows, sensor, methods, None, ReasonCode(fault["reason_code"]))
+                chosen[sensor] = None
+            continue
+        serial = [name for name in methods if name != Method.JOINT]
+        if sensor == Sensor.GYROSCOPE and _joint_drifts(rows, tables):
+            rows = _refused(rows, sensor, [Method.JOINT], None, ReasonCode.OTHER_METHOD_CHOSEN)
+            chosen[sensor] = Approach.SERIAL
+        else:
+            rows = _refused(rows, sensor, serial, None, ReasonCode.OTHER_METHOD_CHOSEN)
+            chosen[sensor] = Approach.JOINT
+    measured["chosen"] = chosen
+    return StageResult({"calibration": rows}, measured=measured)
+
+
+def _refused(
+    rows: pl.DataFrame, sensor: Sensor, methods: list[str], axes: list[str] | None, code: ReasonCode
+) -> pl.DataFrame:
+    """Rows with those of a sensor's methods (of these axes) refused; those refused already keep their own reason."""
+    which = (pl.col("sensor") == sensor) & pl.col("method").is_in(methods) & (pl.col("status") == Status.OK)
+    if axes is not None:
+        which &= pl.col("axis").str.slice(0, 1).is_in(axes)
+    return rows.with_columns(
+        status=pl.when(which).then(pl.lit(str(Status.REFUSED))).otherwise(pl.col("status")),
+        reason_code=pl.when(which).then(pl.lit(str(code))).otherwise(pl.col("reason_code")),
+    ).select(calibration_rows([]).columns)
+
+
+def _joint_drifts(rows: pl.DataFrame, tables: Tables) -> bool:
+    """Whether the VPS speaks for the serial gyroscope against the joint one, both of them published."""
+    published = rows.filter(sensor=Sensor.GYROSCOPE, status=str(Status.OK))["method"].to_list()
+    if "fit" not in tables or Method.OUTPUT_ERROR not in published or Method.JOINT not in published:
+        return False
+    drift = tables["fit"].filter(quantity="attitude_propagated", reference="vps", signal="raw", sample="all")
+    rms = dict(drift.select("method", "rms").iter_rows())
+    joint, serial = rms.get(Method.JOINT), rms.get(Method.OUTPUT_ERROR)
+    return joint is not None and serial is not None and joint > LARGEST_DRIFT_RATIO * serial
+
+
+def _off(off: float, sd: float) -> bool:
+    return abs(off) > max(CONTRADICTED_SD * sd, CONTRADICTED_SHARE)
+
+
+def _contradicted(rows: pl.DataFrame, tables: Tables, s: ChoiceSettings) -> dict[str, list[tuple[float, float]]]:
+    """Of each method's gyroscope, by axis: relative error of the scale by the VPS's rates, and its sd with the
+    constant's own. Nothing without a VPS."""
+    vps, samples = tables.get("vps_aligned"), tables.get("samples")
+    if vps is None or samples is None or len(vps) < 100:
+        return {}
+    out = {}
+    axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
+    origin = int(samples["t_ns"][0])
+    t, at = seconds(samples["t_ns"], origin), seconds(vps["t_ns"], origin)
+    near = bridged(t, at)
+    interval_s = float(np.median(np.diff(at)))
+    reference = low_pass(matrix(vps, RATE_COLUMNS) @ axes, CUTOFF_HZ, interval_s, side_s=SIDE_S)
+    for method in rows.filter(sensor=Sensor.GYROSCOPE)["method"].unique().to_list():
+        found = constants(rows, Sensor.GYROSCOPE, Method(method), refused_too=True)
+        if found is None or not np.isfinite(found[0]).all():
+            continue
+        rate = sensor_model.calibrate(matrix(samples, triad("gyroscope")), *found)
+        own = low_pass(np.column_stack([np.interp(at, t, c) for c in rate.T]), CUTOFF_HZ, interval_s, side_s=SIDE_S)
+        scale = rows.filter(sensor=Sensor.GYROSCOPE, method=method, parameter="scale")
+        relative = {row["axis"]: (row["sd"] or np.inf) / abs(row["value"]) for row in scale.iter_rows(named=True)}
+        out[str(method)] = [
+            (off, float(np.hypot(sd, relative.get(axis, np.inf))))
+            for axis, (off, sd) in zip(AXES, _slopes(own[near], reference[near]), strict=True)
+        ]
+    return out
+
+
+def _slopes(own: Array, reference: Array) -> list[tuple[float, float]]:
+    """Own rates on the reference's, axis by axis beside the other two and a constant: slope less 1, and its sd."""
+    x = np.column_stack([reference, np.ones(len(reference))])
+    out = []
+    for i in range(3):
+        solution = np.linalg.lstsq(x, own[:, i], rcond=None)[0]
+        residual = own[:, i] - x @ solution
+        _, covariance = least_squares_covariance(x[:, None, :], residual[:, None])
+        out.append((float(solution[i] - 1.0), float(np.sqrt(max(covariance[i, i], 0.0)))))
+    return out

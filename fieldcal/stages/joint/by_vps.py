@@ -1,0 +1,209 @@
+"""The estimate with a VPS (`use_vps`): gyroscope, clock and mounting by its attitude, then every vector triad by the
+trajectory that this gives. What the vectors could add to the attitude is less than what their errors would spoil."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fieldcal.errors import EstimationError, FieldcalError, UnusableFlight
+from fieldcal.estimation.by_pose.accelerometer import fit_accelerometer
+from fieldcal.estimation.by_pose.constant_vector import fit_constant_vector
+from fieldcal.estimation.by_pose.gyroscope import fit_gyroscope, start_by_rates
+from fieldcal.estimation.by_pose.triad import CROSS_CHI2, LOWER, OFF_DIAGONAL, TriadByPose, body_axes
+from fieldcal.estimation.clock_sync import by_rates
+from fieldcal.estimation.joint.fit import JointFit
+from fieldcal.estimation.joint.problem import Readings
+from fieldcal.geometry import sensor_model
+from fieldcal.geometry.frames import in_ned
+from fieldcal.geometry.intervals import interval_of
+from fieldcal.geometry.rotation import Array, body_from_inertial, continuous, to_rotation_vector
+from fieldcal.names import VECTOR_SENSORS, Json, Sensor
+from fieldcal.reason_codes import ReasonCode
+from fieldcal.stages.attitude import sensor_attitude
+from fieldcal.stages.inputs import Tables
+from fieldcal.stages.tables import QUATERNION, matrix, seconds
+from fieldcal.stages.vps import vps_attitude
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import JointSettings
+
+POSITION = ("px_m", "py_m", "pz_m")
+
+
+@dataclass(frozen=True)
+class Poses:
+    """VPS stamps (m,), s from the first sample (its epoch `base_s` taken off), attitudes (m, 4) of the sensor axes and
+    positions (m, 3), m, NaN where there is none, both inertial NED; outliers of the attitude masked."""
+
+    t: Array
+    q: Array
+    position: Array
+    base_s: float
+    max_gap_s: float
+
+
+@dataclass(frozen=True)
+class ByVps:
+    """What the VPS determines: `fit` of the gyroscope, `close` of trajectory, clock and mounting; `triads` of the
+    vector sensors in axes of the accelerometer's own (of the gyroscope's, without one), or why there is none; and the
+    numbers."""
+
+    fit: JointFit
+    close: JointFit
+    triads: Mapping[Sensor, TriadByPose | FieldcalError]
+    measured: Mapping[str, Json]
+
+
+def poses_of(tables: Tables, s: JointSettings) -> Poses | None:
+    """The log's VPS, unless `use_vps` is false or there is none."""
+    if s.use_vps is False or "vps" not in tables or tables["vps"].is_empty():
+        return None
+    origin, stamps = int(tables["samples"]["t_ns"][0]), tables["vps"]["t_ns"]
+    base_ns = int(stamps[0]) - origin
+    length_s = (int(tables["samples"]["t_ns"][-1]) - origin) * 1e-9
+    if abs(base_ns) * 1e-9 <= s.vps_max_lag_s + length_s:
+        base_ns = 0
+    t, q = seconds(stamps, origin + base_ns), vps_attitude(matrix(tables["vps"], QUATERNION), s)
+    position = in_ned(matrix(tables["vps"], POSITION), s.world)
+    keep = by_rates.mask_outliers(t, q)
+    return Poses(t[keep], continuous(sensor_attitude(q[keep], s)), position[keep], base_ns * 1e-9, s.vps_max_gap_s)
+
+
+def gyroscope_by_vps(readings: Readings, poses: Poses, s: JointSettings) -> tuple[JointFit, JointFit]:
+    """`fit_gyroscope` on a flight. Raises UnusableFlight, EstimationError."""
+    nominal, polarity = s.nominal_scale[Sensor.GYROSCOPE], s.polarity[Sensor.GYROSCOPE]
+    logged = readings.gyroscope
+    # A unit has its zero at rest; counts have it near their median.
+    zero = np.median(logged, axis=0) if nominal is None else np.zeros(3)
+    unit = np.ones(3) if nominal is None else np.asarray(nominal) * np.asarray(polarity, dtype=float)
+    clock = by_rates.synchronise(
+        readings.t,
+        (logged - zero) * unit,
+        poses.t,
+        poses.q,
+        max_lag_s=s.vps_max_lag_s,
+        min_peak=s.vps_min_peak,
+        max_gap_s=poses.max_gap_s,
+    )
+    scale, rotation = start_by_rates(clock.matrix / unit[:, None], polarity, nominal)
+    start = scale, -scale * zero
+    return fit_gyroscope(readings, poses.t, poses.q, clock, start, rotation, max_gap_s=poses.max_gap_s)
+
+
+def estimate_by_vps(readings: Readings, poses: Poses, s: JointSettings) -> ByVps:
+    """Everything that the VPS determines. Raises UnusableFlight, EstimationError where it can't give a gyroscope."""
+    fit, close = gyroscope_by_vps(readings, poses, s)
+    assert close.vps is not None
+    at = close.vps.to_imu_clock(poses.t, close.state.values)
+    i = interval_of(at, readings.t)
+    known = (readings.t >= at[0]) & (readings.t <= at[-1]) & (at[i + 1] - at[i] <= poses.max_gap_s)
+    triads: dict[Sensor, TriadByPose | FieldcalError] = {}
+    measured = _measured(close, poses)
+    own_axes: tuple[Array, Array] = np.eye(3), np.zeros((3, 3))
+    for sensor in VECTOR_SENSORS[::-1]:  # the accelerometer first: the body axes are its own
+        logged = readings.accelerometer if sensor == Sensor.ACCELEROMETER else readings.magnetometer
+        if logged is None:
+            continue
+        try:
+            found, numbers = _vector_triad(sensor, logged, readings, close, poses, known, at, s)
+        except (UnusableFlight, EstimationError) as error:
+            triads[sensor] = error
+            continue
+        if sensor == Sensor.ACCELEROMETER:
+            found, rotation, uncertainty = body_axes(found, s.polarity[sensor])
+            own_axes = rotation, uncertainty
+        else:
+            found = found.turned(*own_axes)
+        elements = LOWER if sensor == Sensor.ACCELEROMETER else OFF_DIAGONAL
+        test = found.cross_test(elements)
+        full = test > CROSS_CHI2[len(elements)]
+        if not full:
+            found = found.square(np.nanmean(logged, axis=0), elements)
+        triads[sensor] = found
+        measured[f"{sensor}_by_vps"] = {**numbers, "cross_axis_test": test, "cross_axis_kept": full}
+    return ByVps(fit, close, triads, measured)
+
+
+def _vector_triad(
+    sensor: Sensor,
+    logged: Array,
+    readings: Readings,
+    fit: JointFit,
+    poses: Poses,
+    known: np.ndarray,
+    at: Array,
+    s: JointSettings,
+) -> tuple[TriadByPose, dict[str, Json]]:
+    """One vector triad by the trajectory, and the numbers that stand for it."""
+    assert fit.vps is not None
+    by_position = sensor == Sensor.ACCELEROMETER and bool(np.isfinite(poses.position).any())
+    numbers: dict[str, Json] = {"by": "attitude and position" if by_position else "attitude"}
+    if by_position:
+        turn = body_from_inertial(fit.vps.world_rotation(fit.state.values))
+        found = fit_accelerometer(
+            readings.t,
+            readings.segment,
+            logged,
+            fit.path.q,
+            at,
+            poses.position @ turn,
+            gravity_mps2=readings.gravity_mps2,
+            max_gap_s=poses.max_gap_s,
+        )
+        numbers |= _lever_arm(found, s)
+    else:
+        length = (
+            abs(readings.gravity_mps2) if sensor == Sensor.ACCELEROMETER else float(np.linalg.norm(readings.field_ned))
+        )
+        found, vector, _ = fit_constant_vector(
+            readings.t, readings.segment, logged, fit.path.q, known, length=length, polarity=s.polarity[sensor]
+        )
+        down = float(np.degrees(np.arctan2(vector[2], np.hypot(vector[0], vector[1]))))
+        numbers["dip_deg" if sensor == Sensor.MAGNETOMETER else "gravity_below_level_deg"] = down
+    numbers |= {
+        "delay_s": found.delay_s,
+        "delay_sd_s": found.delay_sd_s,
+        "misfit": found.misfit,
+        "colour": found.colour,
+        "mean_robust_weight": float(found.weight.mean()),
+    }
+    return found, numbers
+
+
+def _lever_arm(found: TriadByPose, s: JointSettings) -> dict[str, Json]:
+    """From the VPS's point to the sensor, body axes."""
+    if found.lever_arm_m is None or found.lever_arm_sd_m is None:
+        return {}
+    axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
+    sd = np.sqrt(axes**2 @ found.lever_arm_sd_m**2)
+    return {"lever_arm_m": (axes @ found.lever_arm_m).tolist(), "lever_arm_sd_m": sd.tolist()}
+
+
+def _measured(fit: JointFit, poses: Poses) -> dict[str, Json]:
+    vps = fit.vps
+    assert vps is not None
+    lag, skew = vps.clock_of(fit.state.values)
+    sd = np.sqrt(np.diagonal(fit.covariance)[fit.layout["vps_clock"]])
+    residual, available = vps.residual(fit.model, fit.state)
+    turned = to_rotation_vector(vps.mounting(fit.state.values))
+    return {
+        "use_vps": True,
+        "vps_poses": int(available.sum()),
+        "vps_poses_refused": int((~vps.used).sum()),
+        "vps_residual_deg": float(np.degrees(np.sqrt(np.mean(np.sum(residual[available] ** 2, axis=1))))),
+        "vps_lag_mid_s": lag - poses.base_s,
+        "vps_lag_sd_s": float(sd[0]),
+        "vps_skew_ppm": 1e6 * skew,
+        "vps_skew_sd_ppm": float(1e6 * sd[1]),
+        "vps_body_rotation_deg": float(np.degrees(np.linalg.norm(turned))),
+    }
+
+
+def not_used(error: Exception) -> dict[str, Json]:
+    """Why the VPS was not used, for `measured`."""
+    code = error.reason_code if isinstance(error, FieldcalError) else ReasonCode.UNUSABLE_READINGS
+    return {"use_vps": False, "use_vps_reason": code, "use_vps_sentence": str(error)}

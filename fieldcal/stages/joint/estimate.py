@@ -1,0 +1,401 @@
+"""The joint estimate of all triads and the attitude (method `joint`): by the VPS where there is one, else by vectors;
+judged, tried on held-out data, written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from fieldcal.errors import EstimationError, FieldcalError, UnusableFlight
+from fieldcal.estimation.by_pose.triad import TriadByPose
+from fieldcal.estimation.faults import Fault
+from fieldcal.estimation.joint import initialise, model_selection
+from fieldcal.estimation.joint.fit import JointFit
+from fieldcal.estimation.joint.ladder import fit_with_fallbacks
+from fieldcal.estimation.joint.problem import TERMS, PriorConstants, Readings
+from fieldcal.geometry import sensor_model
+from fieldcal.geometry.intervals import interval_of
+from fieldcal.geometry.rotation import Array, from_matrix, multiply
+from fieldcal.names import SENSORS, Approach, Json, Method, Rung, Sensor, Status
+from fieldcal.reason_codes import ReasonCode
+from fieldcal.stages.attitude import logged_constants
+from fieldcal.stages.inputs import Tables, is_sound, mean_temperature, reference_reading, refusal
+from fieldcal.stages.joint.by_vps import (
+    ByVps,
+    Poses,
+    estimate_by_vps,
+    gyroscope_by_vps,
+    not_used,
+    poses_of,
+)
+from fieldcal.stages.joint.judgement import judged, judged_scales, judged_zeros, measured_of, triad_of
+from fieldcal.stages.results import StageResult, fatal_fault, fault_rows, triad_rows, zero_slope_rows
+from fieldcal.stages.tables import (
+    AXES,
+    QUATERNION,
+    CalibrationRow,
+    calibration_rows,
+    columns_of,
+    constants,
+    covariance_table,
+    matrix,
+    seconds,
+    triad,
+)
+
+if TYPE_CHECKING:
+    from fieldcal.config.stage_settings import JointSettings
+
+SERIAL_METHODS: dict[Sensor, tuple[Method | None, ...]] = {
+    Sensor.MAGNETOMETER: (None,),
+    Sensor.ACCELEROMETER: (None,),
+    Sensor.GYROSCOPE: (Method.OUTPUT_ERROR, Method.EQUATION_ERROR),
+}
+UNITS = {Sensor.MAGNETOMETER: "", Sensor.ACCELEROMETER: "m/s^2", Sensor.GYROSCOPE: "rad/s"}
+# A magnetometer's readings count as one each only where they are about as many as the gyroscope's.
+SPARSE = 0.9
+HELD_IN_SHARE = 0.7
+
+
+@dataclass(frozen=True)
+class Found:
+    """A triad's constants in logged units, matrix (3, 3) and bias (3,), with the covariance (6, 6) of its diagonal and
+    bias, the sd (3, 3) of a full matrix, and why an axis' scale or zero is refused."""
+
+    matrix: Array
+    bias: Array
+    covariance: Array
+    cross_sd: Array | None
+    codes: list[ReasonCode | None]
+    zero_codes: list[ReasonCode | None]
+
+
+def estimate_jointly(tables: Tables, s: JointSettings) -> StageResult:
+    """samples, serial constants, VPS → calibration, covariance, trajectory, held_out: everything in one likelihood."""
+    if not chosen(s):
+        return StageResult(status=Status.ABSENT, reason_code=ReasonCode.NOT_SELECTED, reason='The method is "serial".')
+    if "samples" not in tables:
+        return StageResult(
+            status=Status.REFUSED, reason_code=ReasonCode.NO_SAMPLES, reason="No segment of the log is usable."
+        )
+    fault = fatal_fault(tables["faults"], ("gyroscope",)) if "faults" in tables else None
+    if fault is not None:
+        return StageResult(status=Status.REFUSED, reason_code=ReasonCode(fault["reason_code"]), reason=fault["reason"])
+    if tables["samples"]["gyroscope_x"].null_count():
+        return StageResult(
+            status=Status.REFUSED, reason_code=ReasonCode.NO_GYROSCOPE, reason="The joint estimate needs a gyroscope."
+        )
+    readings = readings_of(tables, s)
+    poses = poses_of(tables, s)
+    by_vps: Mapping[str, Json] = {"use_vps": False} if s.use_vps is True else {}
+    if poses is not None:
+        try:
+            return _with_vps(estimate_by_vps(readings, poses, s), readings, tables, s, poses)
+        except (UnusableFlight, EstimationError) as error:
+            by_vps = not_used(error)
+    return _with_vectors(readings, tables, s, by_vps)
+
+
+def _with_vps(found: ByVps, readings: Readings, tables: Tables, s: JointSettings, poses: Poses) -> StageResult:
+    fit, tests = model_selection.add_terms(found.fit)
+    triads = {}
+    for sensor in chosen(s):
+        by_pose = found.triads.get(sensor)
+        if sensor in fit.layout:
+            triads[sensor] = _of_fit(fit, sensor, s)
+        elif isinstance(by_pose, TriadByPose):
+            triads[sensor] = _by_pose(by_pose, sensor, s)
+    measured = {
+        **measured_of(fit, _axes(s)),
+        **found.measured,
+        "rung": Rung.BY_VPS,
+        "terms": model_selection.summary(tests, fit),
+    }
+    missing = {str(name): str(v) for name, v in found.triads.items() if isinstance(v, FieldcalError)}
+    result = _written(triads, fit, found.close, tables, s, measured, missing)
+    return replace(result, tables={**result.tables, **_held_out(fit, readings, tables, s, poses)})
+
+
+def _by_pose(triad: TriadByPose, sensor: Sensor, s: JointSettings) -> Found:
+    """A vector triad by the VPS's trajectory, judged by the flight's settings."""
+    codes: list[ReasonCode | None] = [ReasonCode.NOT_A_SPHERE] * 3
+    if triad.misfit <= s.ellipsoid_max_residual:
+        codes = judged_scales(
+            np.diagonal(triad.matrix),
+            triad.diagonal_covariance,
+            polarity=s.polarity[sensor],
+            nominal_scale=s.nominal_scale[sensor],
+            max_scale_sd=s.ellipsoid_max_scale_sd,
+        )
+    return _found(triad.matrix, triad.bias, triad.diagonal_covariance, triad.cross_sd, codes, priors(s).get(sensor))
+
+
+def _found(
+    matrix: Array,
+    bias: Array,
+    covariance: Array,
+    cross_sd: Array | None,
+    codes: list[ReasonCode | None],
+    prior: PriorConstants | None,
+) -> Found:
+    scale = np.diagonal(matrix)
+    slope = np.hstack([np.diag(bias / scale**2), np.diag(-1.0 / scale)])
+    zero_sd = np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0.0))
+    return Found(matrix, bias, covariance, cross_sd, codes, judged_zeros(codes, zero_sd, prior))
+
+
+def _with_vectors(readings: Readings, tables: Tables, s: JointSettings, by_vps: Mapping[str, Json]) -> StageResult:
+    axes = _axes(s)
+    try:
+        outcome = fit_with_fallbacks(readings, start_constants(tables, s, readings), priors(s), lever_arm=_lever_arm(s))
+    except UnusableFlight as error:
+        return refusal(error, "joint estimate", by_vps)
+    except EstimationError as error:
+        # It could run and found that the readings contradict each other: no other method is to be believed instead.
+        found = refusal(error, "joint estimate", by_vps)
+        faults = [
+            Fault(sensor, "", error.reason_code, 0.0, 0.0, True, found.reason or str(error)) for sensor in chosen(s)
+        ]
+        return replace(found, tables={"faults": fault_rows(faults)})
+    fit, tests = model_selection.add_terms(outcome.fit)
+    triads = {sensor: _of_fit(fit, sensor, s) for sensor in chosen(s) if sensor in fit.layout}
+    measured = {
+        **measured_of(fit, axes),
+        **by_vps,
+        "rung": outcome.rung,
+        "rungs_without_a_minimum": dict(outcome.failed),
+        "terms": model_selection.summary(tests, fit),
+    }
+    result = _written(triads, fit, fit, tables, s, measured, {})
+    return replace(result, tables={**result.tables, **_held_out(fit, readings, tables, s, None)})
+
+
+def chosen(s: JointSettings) -> tuple[Sensor, ...]:
+    """Sensors whose constants this method is to give."""
+    return tuple(name for name in SENSORS if s.method[name] != Approach.SERIAL)
+
+
+def priors(s: JointSettings) -> dict[str, PriorConstants]:
+    """What is known of each sensor whose unit, or nominal scale, is."""
+    zero = {
+        Sensor.GYROSCOPE: np.radians(s.prior_gyroscope_zero_dps),
+        Sensor.ACCELEROMETER: s.prior_accelerometer_zero_mps2,
+        Sensor.MAGNETOMETER: s.prior_magnetometer_zero * float(np.linalg.norm(s.field_ned)),
+    }
+    out = {}
+    for sensor in SENSORS:
+        nominal = s.nominal_scale[sensor]
+        if nominal is None:
+            continue
+        scale = np.asarray(nominal) * np.asarray(s.polarity[sensor], dtype=float)
+        covariance = np.diag(np.r_[(s.prior_scale_sd * scale) ** 2, np.full(3, zero[sensor] ** 2)])
+        if sensor == Sensor.MAGNETOMETER:
+            covariance[:3, :3] += s.prior_magnetometer_scale_sd**2 * np.outer(scale, scale)
+        out[str(sensor)] = PriorConstants(scale, np.zeros(3), covariance)
+    return out
+
+
+def _axes(s: JointSettings) -> Array:
+    return sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
+
+
+def _lever_arm(s: JointSettings) -> Array | None:
+    """As measured on the vehicle, sensor axes."""
+    return None if s.lever_arm_m is None else np.asarray(_axes(s).T @ np.asarray(s.lever_arm_m, dtype=float))
+
+
+def _held_out(
+    fit: JointFit, readings: Readings, tables: Tables, s: JointSettings, poses: Poses | None
+) -> dict[str, pl.DataFrame]:
+    """Gyroscope constants from the first part of the flight alone, with `from_ns`, where the rest begins: `verify`
+    predicts that. None where the part determines nothing, or another method gives the gyroscope's."""
+    if Sensor.GYROSCOPE not in chosen(s):
+        return {}
+    split = int(HELD_IN_SHARE * len(readings.t))
+    part = readings.part(slice(0, split))
+    try:
+        if poses is not None:
+            early, _ = gyroscope_by_vps(part, poses, s)
+        else:
+            start: dict[str, tuple[Array, Array] | None] = {
+                name: fit.constants(name)[:2] for name in SENSORS if name in fit.layout
+            }
+            early = fit_with_fallbacks(part, start, fit.priors, lever_arm=_lever_arm(s)).fit
+        kept = [name for name in TERMS if name in fit.layout]
+        early = model_selection.with_terms(early, kept) if kept else early
+    except (UnusableFlight, EstimationError):
+        return {}
+    matrix, bias, covariance, _ = triad_of(early, "gyroscope")
+    rows = triad_rows(
+        Sensor.GYROSCOPE,
+        Method.JOINT,
+        matrix,
+        bias,
+        covariance,
+        unit="rad/s",
+        logged_unit=s.units[Sensor.GYROSCOPE],
+        reference_reading=reference_reading(s, Sensor.GYROSCOPE, readings.gyroscope),
+        temperature_degc=mean_temperature(tables),
+    )
+    return {"held_out": calibration_rows(rows).with_columns(from_ns=pl.lit(int(tables["samples"]["t_ns"][split])))}
+
+
+def readings_of(tables: Tables, s: JointSettings) -> Readings:
+    """Logged readings of the used segments; a slow magnetometer's only at the samples nearest to its
+    own stamps; none of a triad with a fatal fault."""
+    samples = tables["samples"]
+    t = seconds(samples["t_ns"], samples["t_ns"][0])
+    segment = samples["segment"].to_numpy()
+    logged: dict[str, Array] = {name: matrix(samples, triad(name)) for name in SENSORS}
+    magnetometer = tables.get("magnetometer_log")
+    if magnetometer is not None and len(magnetometer) < SPARSE * len(tables["imu"]):
+        has_reading = np.zeros(len(t), dtype=bool)
+        at = seconds(magnetometer["t_ns"], samples["t_ns"][0])
+        before = interval_of(t, at, on_stamp="ends")
+        nearest = np.where(at - t[before] < t[before + 1] - at, before, before + 1)
+        has_reading[nearest[np.abs(t[nearest] - at) < 2.0 * float(np.median(np.diff(t)))]] = True
+        logged["magnetometer"] = np.where(has_reading[:, None], logged["magnetometer"], np.nan)
+    vectors = {name: x for name, x in logged.items() if name != "gyroscope"}
+    given = {name: x if is_sound(tables, name) and np.isfinite(x).any() else None for name, x in vectors.items()}
+    return Readings(
+        warmth=_warmth(tables, t),
+        t=t,
+        segment=segment,
+        gyroscope=logged["gyroscope"],
+        gravity_mps2=sensor_model.GRAVITY_SIGNS[s.gravity_sign] * s.gravity_mps2,
+        field_ned=np.asarray(s.field_ned, dtype=float),
+        turning=initialise.turning(t, segment, logged["gyroscope"]),
+        **given,
+    )
+
+
+def _warmth(tables: Tables, t: Array) -> Array | None:
+    """Temperature at the samples less its mean, °C (n,); None without one."""
+    table = tables.get("temperature")
+    if table is None or (table := table.drop_nulls()).is_empty():
+        return None
+    at = seconds(table["t_ns"], tables["samples"]["t_ns"][0])
+    warm = np.interp(t, at, table["temperature_degc"].to_numpy())
+    return np.asarray(warm - warm.mean())
+
+
+def start_constants(tables: Tables, s: JointSettings, readings: Readings) -> dict[str, tuple[Array, Array] | None]:
+    """The serial chain's constants where it has them, else what the logged unit says, else refused values, else an
+    ellipsoid fit."""
+    out: dict[str, tuple[Array, Array] | None] = {}
+    magnitudes = {
+        Sensor.MAGNETOMETER: float(np.linalg.norm(s.field_ned)),
+        Sensor.ACCELEROMETER: s.gravity_mps2,
+    }
+    for name in SENSORS:
+        found = None
+        for method in SERIAL_METHODS[name]:
+            if found is None and name in tables:
+                found = constants(tables[name], name, method)
+        found = found or logged_constants(s, name)
+        out[name] = None if found is None else (np.diagonal(found[0]).copy(), found[1])
+        logged = getattr(readings, name)
+        if out[name] is None and name in magnitudes and logged is not None:
+            polarity = np.array(s.polarity[name], dtype=np.float64)
+            out[name] = initialise.start_of_triad(logged, magnitudes[name], polarity)
+    return out
+
+
+def _of_fit(fit: JointFit, sensor: Sensor, s: JointSettings) -> Found:
+    """A triad of the fit, judged by the flight's settings."""
+    full, bias, covariance, cross_sd = triad_of(fit, sensor)
+    codes = judged(
+        sensor,
+        fit,
+        np.diagonal(full),
+        covariance,
+        polarity=s.polarity[sensor],
+        nominal_scale=s.nominal_scale[sensor],
+        max_scale_sd=s.gyro_max_scale_sd if sensor == Sensor.GYROSCOPE else s.ellipsoid_max_scale_sd,
+        max_residual=s.ellipsoid_max_residual,
+    )
+    # A held accelerometer tells no zero either.
+    held = ReasonCode.HELD_AT_NOMINAL in codes and sensor != Sensor.GYROSCOPE
+    return _found(full, bias, covariance, cross_sd, codes, None if held else priors(s).get(sensor))
+
+
+def _written(
+    triads: Mapping[Sensor, Found],
+    fit: JointFit,
+    path: JointFit,
+    tables: Tables,
+    s: JointSettings,
+    measured: Mapping[str, Json],
+    missing: Mapping[str, str],
+) -> StageResult:
+    """Rows with a status by sensor and axis, the attitude, the covariance, and the numbers that decided. `path`
+    has the attitudes; `missing`: sensor → why it has no constants at all."""
+    rows: list[CalibrationRow] = []
+    for sensor, found in triads.items():
+        rows += triad_rows(
+            sensor,
+            Method.JOINT,
+            found.matrix,
+            found.bias,
+            found.covariance,
+            unit=UNITS[sensor] or s.field_unit,
+            logged_unit=s.units[sensor],
+            reference_reading=reference_reading(s, sensor, matrix(tables["samples"], triad(sensor))),
+            temperature_degc=mean_temperature(tables),
+            reason_code=found.codes,
+            zero_reason_code=found.zero_codes,
+            cross_sd=found.cross_sd,
+        )
+    if Sensor.GYROSCOPE in triads:
+        rows += _slope_rows(fit, tables, s, triads[Sensor.GYROSCOPE].zero_codes)
+    codes = [(f"{name} {axis}", c) for name, v in triads.items() for axis, c in zip(AXES, v.codes, strict=True) if c]
+    every = all(code for found in triads.values() for code in (*found.codes, *found.zero_codes))
+    first = next((code for _, code in codes), None)
+    parts = []
+    if codes:
+        parts.append(f"Refused by the joint estimate ({', '.join(f'{axis}: {code}' for axis, code in codes)}).")
+        parts.append(str(measured["advice"]))
+    parts += [f"{name.capitalize()}: {sentence}" for name, sentence in missing.items()]
+    reason = " ".join(part for part in parts if part) or None
+    if not triads:
+        first, reason = (
+            ReasonCode(f"no_{chosen(s)[0]}"),
+            "None of the sensors that method joint is chosen for has readings.",
+        )
+    result = {"calibration": calibration_rows(rows), "covariance": covariance_table(fit.covariance)}
+    if fit.vps is not None or not any(_of_fit(fit, Sensor.GYROSCOPE, s).codes):
+        result["trajectory"] = _trajectory(path, tables, _axes(s))
+    return StageResult(result, Status.REFUSED if every else Status.OK, first, reason, measured)
+
+
+def _slope_rows(
+    fit: JointFit, tables: Tables, s: JointSettings, codes: list[ReasonCode | None]
+) -> list[CalibrationRow]:
+    """The gyroscope's zero against temperature, where the flight shows it."""
+    if "gyroscope_temperature" not in fit.layout:
+        return []
+    spread = fit.model.triads["gyroscope"].spread
+    value = -fit.state.values["gyroscope_temperature"] * spread
+    sd = np.sqrt(np.diagonal(fit.covariance)[fit.layout["gyroscope_temperature"]]) * spread
+    return zero_slope_rows(
+        Sensor.GYROSCOPE,
+        Method.JOINT,
+        value,
+        sd,
+        logged_unit=s.units[Sensor.GYROSCOPE],
+        temperature_degc=mean_temperature(tables),
+        reason_code=codes,
+    )
+
+
+def _trajectory(fit: JointFit, tables: Tables, axes: Array) -> pl.DataFrame:
+    """Attitude of the body at every sample."""
+    samples = tables["samples"]
+    q = multiply(fit.path.q, from_matrix(axes))
+    return samples.select("t_ns", "segment").with_columns(
+        **{name: pl.Series(values) for name, values in columns_of(q, QUATERNION).items()}
+    )
