@@ -216,6 +216,8 @@ class ReasonCode(StrEnum):
     """The recording tells nothing of it: the value is the one known beforehand."""
     PRIOR_CONTRADICTED = "prior_contradicted"
     """Many standard deviations of what was known beforehand away from it."""
+    FIELD_CONTRADICTED = "field_contradicted"
+    """The field has another direction than the configured one."""
     COARSE = "coarse"
     """A channel's resolution is too coarse for what it reads."""
     VPS_CONTRADICTS = "vps_contradicts"

@@ -32,6 +32,9 @@ HOLDS_LEFT_OUT = 10
 COARSE_SHARE = 0.1
 """Largest step of a channel's resolution, as a share of its standard deviation: errors of one per cent."""
 
+DITHERED_SHARE = 0.3
+"""Share of successive readings that differ where noise spreads them over steps."""
+
 ROUNDING_SHARE = 1e-9
 """Steps below this share of a channel's largest value are rounding of floating point."""
 
@@ -174,7 +177,9 @@ def coarse_faults(sensor: str, logged: ArrayLike, unit: str) -> list[Fault]:
     faults = []
     for axis, x in zip(AXES, np.asarray(logged, dtype=float).T, strict=True):
         step, spread = resolution(x), float(np.std(x))
-        if step > COARSE_SHARE * spread > 0.0:
+        # Noise of a step or so makes rounding white: then it is noise like any other.
+        dithered = float(np.mean(np.diff(x) != 0.0)) > DITHERED_SHARE
+        if step > COARSE_SHARE * spread > 0.0 and not dithered:
             sentence = (
                 f"The {sensor}'s {axis} is logged in steps of {step:.3g} {unit} where it varies by {spread:.3g} {unit}"
                 " rms: rounding of a tenth and more goes with the motion and is no noise."

@@ -47,6 +47,7 @@ def choose(tables: Tables, s: ChoiceSettings) -> StageResult:
         axes = [axis for axis, (off, sd) in zip(AXES, pairs, strict=True) if _off(off, sd) and axis in published]
         if axes:
             rows = _refused(rows, Sensor.GYROSCOPE, [method], axes, ReasonCode.VPS_CONTRADICTS)
+    contradictions = tables.get("joint_faults")
     chosen: dict[str, Json] = {}
     for sensor in SENSORS:
         if s.method[sensor] != Approach.AUTO:
@@ -55,7 +56,7 @@ def choose(tables: Tables, s: ChoiceSettings) -> StageResult:
         methods = own["method"].unique().to_list()
         if Method.JOINT not in methods:
             chosen[sensor] = Approach.SERIAL
-            fault = fatal_fault(tables["joint_faults"], (sensor,)) if "joint_faults" in tables else None
+            fault = None if contradictions is None else fatal_fault(contradictions, (sensor,))
             if fault is not None:
                 rows = _refused(rows, sensor, methods, None, ReasonCode(fault["reason_code"]))
                 chosen[sensor] = None

@@ -381,6 +381,12 @@ def test_values_too_coarse_for_their_motion_are_refused_with_the_step() -> None:
     assert coarse_faults("accelerometer", np.rint(x * 10.0) / 10.0 + 0.3, "m/s^2") == []
 
 
+def test_noise_of_a_step_makes_coarse_values_ordinary_noise() -> None:
+    rng = np.random.default_rng(7)
+    x = np.rint(rng.normal(scale=1.4, size=(3000, 3)))
+    assert coarse_faults("gyroscope", x, "counts") == []
+
+
 def test_resolution_is_the_least_step() -> None:
     assert resolution(np.array([3.0, 5.0, 5.0, 9.0])) == 2.0
     assert resolution(np.full(4, 7.0)) == 0.0

@@ -301,7 +301,8 @@ def test_a_dry_run_changes_nothing(archive: Path, warehouse: Path, tmp_path: Pat
     shutil.rmtree(warehouse / "stages" / "verify")
     before = file_hashes(warehouse)
     plan = dry_run(archive, warehouse, None, None)
-    assert [log["would_run"] for log in plan["logs"]] == [{"verify": "no result yet"}] * 2
+    would_run = {"verify": "no result yet", "choice": "new input: verify"}
+    assert [log["would_run"] for log in plan["logs"]] == [would_run] * 2
     assert file_hashes(warehouse) == before
 
 

@@ -11,6 +11,7 @@ import pytest
 from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import settings, signals, truth
 from fieldcal.simulation.experiment import SimulatedFlight, simulate
+from fieldcal.stages.joint.estimate import each_once
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
 
@@ -138,3 +139,34 @@ def test_one_sensor_alone_may_be_joint() -> None:
     assert set(results["joint"].tables["calibration"]["sensor"]) == {"magnetometer", "accelerometer"}
     assert "held_out" not in results["joint"].tables
     assert "joint" not in results["verify"].tables["fit"].filter(quantity="body_rate")["method"].to_list()
+
+
+def test_held_values_count_once() -> None:
+    x = np.repeat(np.arange(30.0).reshape(10, 3), 4, axis=0)
+    once = each_once(x)
+    assert np.flatnonzero(np.isfinite(once).all(axis=1)).tolist() == list(range(0, 40, 4))
+    assert each_once(np.arange(60.0).reshape(20, 3)).tolist() == np.arange(60.0).reshape(20, 3).tolist()
+
+
+def test_a_magnetometer_sampled_and_held_is_calibrated_as_one_that_is_not() -> None:
+    r = simulate(seed=37)
+    frames = signals(r)
+    columns = [f"magnetometer_{axis}" for axis in "xyz"]
+    held = frames["magnetometer"].select(columns).to_numpy()
+    held = held[np.arange(len(held)) // 18 * 18]  # ten a second
+    frames["magnetometer"] = frames["magnetometer"].with_columns(
+        **{c: pl.Series(np.ascontiguousarray(held[:, i])) for i, c in enumerate(columns)}
+    )
+    rows = run_flight(frames, settings(r.experiment, method="joint"))["joint"].tables["calibration"]
+    rows = rows.filter(pl.col("axis").is_in(["x", "y", "z"]), sensor="magnetometer", parameter="scale")
+    z = (rows["value"].to_numpy() - truth(r)["constants"]["magnetometer"]["scale"]) / rows["sd"].to_numpy()
+    assert np.abs(z).max() < 4.0
+
+
+def test_a_field_of_another_place_is_refused_by_the_vps_s_horizon() -> None:
+    r = simulate(seed=38, dip_rad=np.radians(65.0), duration_s=25.0)
+    north, _, down = settings(r.experiment).field_ned
+    result = run_flight(signals(r), settings(r.experiment, method="joint", field_ned=(north, 0.0, -down)))["joint"]
+    assert result.tables["calibration"].filter(sensor="magnetometer").is_empty()
+    assert "place" in (result.reason or "")
+    assert set(result.tables["calibration"].filter(sensor="gyroscope")["status"]) == {"ok"}

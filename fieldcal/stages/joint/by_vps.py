@@ -31,6 +31,8 @@ from fieldcal.stages.vps import vps_attitude
 if TYPE_CHECKING:
     from fieldcal.config.stage_settings import JointSettings
 
+# Of the field's dip from the configured one: more is a wrong place. A VPS's world may be out of level by some degrees.
+MAX_DIP_DIFFERENCE_DEG = 20.0
 POSITION = ("px_m", "py_m", "pz_m")
 
 
@@ -162,7 +164,15 @@ def _vector_triad(
         found, vector, _ = fit_constant_vector(
             readings.t, readings.segment, logged, fit.path.q, known, length=length, polarity=s.polarity[sensor]
         )
-        down = float(np.degrees(np.arctan2(vector[2], np.hypot(vector[0], vector[1]))))
+        down = _dip_deg(vector)
+        expected = _dip_deg(readings.field_ned)
+        if sensor == Sensor.MAGNETOMETER and abs(down - expected) > MAX_DIP_DIFFERENCE_DEG:
+            raise UnusableFlight(
+                ReasonCode.FIELD_CONTRADICTED,
+                f"The field dips by {down:.0f}° below the VPS's horizon where {expected:.0f}° is configured: is the"
+                " field's place (latitude and longitude), or its direction, the right one?",
+                {"dip_deg": down, "dip_expected_deg": expected},
+            )
         numbers["dip_deg" if sensor == Sensor.MAGNETOMETER else "gravity_below_level_deg"] = down
     numbers |= {
         "delay_s": found.delay_s,
@@ -172,6 +182,10 @@ def _vector_triad(
         "mean_robust_weight": float(found.weight.mean()),
     }
     return found, numbers
+
+
+def _dip_deg(field: Array) -> float:
+    return float(np.degrees(np.arctan2(field[2], np.hypot(field[0], field[1]))))
 
 
 def _lever_arm(found: TriadByPose, s: JointSettings) -> dict[str, Json]:

@@ -59,6 +59,8 @@ UNITS = {Sensor.MAGNETOMETER: "", Sensor.ACCELEROMETER: "m/s^2", Sensor.GYROSCOP
 # A magnetometer's readings count as one each only where they are about as many as the gyroscope's.
 SPARSE = 0.9
 HELD_IN_SHARE = 0.7
+# Share of rows that bring a new value of a triad; with fewer its values are held.
+LEAST_FRESH = 0.5
 
 
 @dataclass(frozen=True)
@@ -259,7 +261,7 @@ def readings_of(tables: Tables, s: JointSettings) -> Readings:
         nearest = np.where(at - t[before] < t[before + 1] - at, before, before + 1)
         has_reading[nearest[np.abs(t[nearest] - at) < 2.0 * float(np.median(np.diff(t)))]] = True
         logged["magnetometer"] = np.where(has_reading[:, None], logged["magnetometer"], np.nan)
-    vectors = {name: x for name, x in logged.items() if name != "gyroscope"}
+    vectors = {name: each_once(x) for name, x in logged.items() if name != "gyroscope"}
     given = {name: x if is_sound(tables, name) and np.isfinite(x).any() else None for name, x in vectors.items()}
     return Readings(
         warmth=_warmth(tables, t),
@@ -271,6 +273,16 @@ def readings_of(tables: Tables, s: JointSettings) -> Readings:
         turning=initialise.turning(t, segment, logged["gyroscope"]),
         **given,
     )
+
+
+def each_once(x: Array) -> Array:
+    """Readings (n, 3) of a sensor whose values are held over most rows (it is slower than the log), each only where it
+    came; as they are where most rows bring a new one."""
+    fresh = np.r_[True, np.any(np.diff(x, axis=0) != 0.0, axis=1)]
+    known = np.isfinite(x).all(axis=1)
+    if not known.any() or fresh[known].mean() > LEAST_FRESH:
+        return x
+    return np.where(fresh[:, None], x, np.nan)
 
 
 def _warmth(tables: Tables, t: Array) -> Array | None:
