@@ -149,7 +149,7 @@ def _stuck(sensor: str, axis: str, t: Array, x: Array, beside: Array, unit: str)
     usual = float(np.quantile(np.sort(held)[: max(1, len(held) - HOLDS_LEFT_OUT)], 0.99))
     limit = max(STUCK_S, STUCK_RATIO * usual)
     stuck = held > limit
-    step = np.array([np.diff(np.unique(column)).min(initial=np.inf) for column in beside.T])
+    step = np.array([resolution(column) for column in beside.T])
     for k in np.flatnonzero(stuck):
         moved = np.ptp(beside[start[k] : end[k] + 1], axis=0)
         # All axes without any change at all: the logger froze.

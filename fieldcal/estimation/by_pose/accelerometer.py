@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from fieldcal.errors import UnusableFlight
-from fieldcal.estimation.by_pose.triad import TriadByPose
+from fieldcal.estimation.by_pose.triad import TriadByPose, axis_sigma
 from fieldcal.estimation.motion_selection import contiguous
 from fieldcal.estimation.robust import reweighted
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.smoothing import differentiate_samples, fill, lattice, low_pass
-from fieldcal.estimation.statistics import colour, least_squares_covariance, robust_sigma
+from fieldcal.estimation.statistics import colour, least_squares_covariance
 from fieldcal.geometry.rotation import Array, body_from_inertial, normalise
 from fieldcal.reason_codes import ReasonCode
 
@@ -200,7 +200,7 @@ def _solved(columns: Array, y: Array, centre: Array, spread: float, g: float) ->
             scale = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
             theta = np.linalg.lstsq(flat / scale, (level * root).reshape(-1), rcond=1e-9)[0] / scale
         residual = level - x @ theta
-        return (theta, residual), np.linalg.norm(residual / np.maximum(_spread(residual), 1e-12), axis=1)
+        return (theta, residual), np.linalg.norm(residual / axis_sigma(residual), axis=1)
 
     (theta, residual), weight = reweighted(solve, len(y), rounds=REGRESSION_ROUNDS)
     root = np.sqrt(weight)[:, None]
@@ -227,7 +227,3 @@ def _to_logged(centre: Array, spread: float) -> Array:
     out[:9] /= spread
     out[9:, :9] = -np.kron(np.eye(3), centre) / spread
     return out
-
-
-def _spread(residual: Array) -> Array:
-    return np.array([robust_sigma(r) for r in residual.T])

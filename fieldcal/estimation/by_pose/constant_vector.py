@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldcal.errors import EstimationError, UnusableFlight
-from fieldcal.estimation.by_pose.triad import TriadByPose
+from fieldcal.estimation.by_pose.triad import TriadByPose, axis_sigma
 from fieldcal.estimation.robust import reweighted
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.smoothing import differentiate_samples
-from fieldcal.estimation.statistics import colour, least_squares_covariance, robust_sigma
+from fieldcal.estimation.statistics import colour, least_squares_covariance
 from fieldcal.geometry.rotation import Array, body_from_inertial
 from fieldcal.reason_codes import ReasonCode
 
@@ -75,7 +75,7 @@ def fit_constant_vector(
 
     def solve(weight: Array) -> tuple[tuple[Array, Array, Array, Array], Array]:
         found = _minimised(x, turn, slope, weight, length)
-        return found, np.linalg.norm(found[2] / _spread(found[2]), axis=1)
+        return found, np.linalg.norm(found[2] / axis_sigma(found[2]), axis=1)
 
     (theta, h, residual, sensitivity), weight = reweighted(solve, len(x), rounds=REGRESSION_ROUNDS)
     root = np.sqrt(weight)[:, None]
@@ -136,17 +136,16 @@ def _minimised(x: Array, turn: Array, slope: Array, weight: Array, length: float
     coefficients = np.linalg.lstsq(regressor, x * root, rcond=1e-6)[0]
     shared = np.linalg.svd(coefficients[:9].T.reshape(9, 3))[2][0]
     h = length * shared / np.linalg.norm(shared)
+    # Given the field B and z are linear.
     theta = np.zeros(PARAMETERS)
+    linear = np.column_stack([turn @ h, np.ones(len(turn))]) * root
+    solved = np.linalg.lstsq(linear, x * root, rcond=1e-9)[0]
+    theta[:9], theta[9:12] = solved[:3].T.ravel(), solved[3]
     eye = np.eye(3)
     cost = np.inf
     for _ in range(MAX_ITERATIONS):
         seen = turn @ h
         sensitivity = np.zeros((len(x), 3, PARAMETERS))
-        # Given the field B and z are linear; the first round starts there.
-        if not theta[:9].any():
-            linear = np.column_stack([seen, np.ones(len(seen))]) * root
-            solved = np.linalg.lstsq(linear, x * root, rcond=1e-9)[0]
-            theta[:9], theta[9:12] = solved[:3].T.ravel(), solved[3]
         b = theta[:9].reshape(3, 3)
         across = _across(h)
         sensitivity[..., :9] = np.einsum("ij,nk->nijk", eye, seen).reshape(len(x), 3, 9)
@@ -173,7 +172,3 @@ def _minimised(x: Array, turn: Array, slope: Array, weight: Array, length: float
 def _across(h: Array) -> Array:
     """Two directions across the field, of its length, (3, 2)."""
     return np.linalg.svd(h[None])[2][1:].T * np.linalg.norm(h)
-
-
-def _spread(residual: Array) -> Array:
-    return np.maximum([robust_sigma(r) for r in residual.T], 1e-12)

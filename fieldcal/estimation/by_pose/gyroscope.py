@@ -141,7 +141,7 @@ def attitudes(
     """Attitude (n, 4) at every sample: the VPS's, carried over its gaps by the gyroscope. Raises `vps_too_short` where
     there is none."""
     relative = propagate_stretches(r.t, r.gyroscope * start[0] + start[1], r.segment)
-    on_vps_clock = (r.t - clock.reference_s) * (1.0 + 1e-6 * clock.skew_ppm) + clock.reference_s - clock.lag_mid_s
+    on_vps_clock = clock.to_vps_clock(r.t)
     at = interval_of(t_vps, on_vps_clock)
     seen = (on_vps_clock >= t_vps[0]) & (on_vps_clock <= t_vps[-1]) & (t_vps[at + 1] - t_vps[at] <= max_gap_s)
     if not seen.any():

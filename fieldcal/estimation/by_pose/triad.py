@@ -7,14 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fieldcal.estimation.statistics import robust_sigma
 from fieldcal.geometry.rotation import Array, skew
 
-# χ²₃ and χ²₆, exceeded by chance once in a thousand: below it a triad's axes are taken for square.
-CROSS_CHI2 = {3: 16.3, 6: 22.5}
 DIFFERENCE_SHARE = 1e-6  # of a matrix element, for the derivatives of a decomposition
-# Off-diagonal elements that are free: of a triad in axes of its own, and of one in another's.
-LOWER = ((1, 0), (2, 0), (2, 1))
-OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 
 
 @dataclass(frozen=True)
@@ -90,6 +86,11 @@ class TriadByPose:
         matrix = value[:9].reshape(3, 3)
         matrix[tuple(np.array(elements).T)] = 0.0  # exactly: rounding leaves dust
         return replace(self, matrix=matrix, bias=value[9:], covariance=back @ covariance @ back.T)
+
+
+def axis_sigma(residual: Array) -> Array:
+    """Robust standard deviation of each axis of residuals (n, 3), at least 1e-12."""
+    return np.maximum([robust_sigma(r) for r in residual.T], 1e-12)
 
 
 def body_axes(triad: TriadByPose, polarity: ArrayLike) -> tuple[TriadByPose, Array, Array]:

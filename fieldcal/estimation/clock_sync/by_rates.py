@@ -88,6 +88,11 @@ class SyncFit:
         """Standard deviation of the skew, ppm."""
         return float(1e6 * np.sqrt(self.covariance[1, 1]))
 
+    def to_vps_clock(self, t_imu: ArrayLike) -> Array:
+        """IMU stamps, s, on the VPS's clock."""
+        t = np.asarray(t_imu, dtype=float)
+        return (t - self.reference_s) * (1 + 1e-6 * self.skew_ppm) + self.reference_s - self.lag_mid_s
+
     def to_imu_clock(self, t_vps: ArrayLike) -> Array:
         """VPS stamps, s, on the IMU clock."""
         t = np.asarray(t_vps, dtype=float)

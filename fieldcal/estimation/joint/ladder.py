@@ -64,12 +64,13 @@ def fit_with_fallbacks(
         What the first rung that was tried met, when none stands.
     """
     failed: dict[str, str] = {}
-    first: FailedRung | None = None
+    first: UnusableFlight | EstimationError | None = None
     known = {name: (prior.scale, prior.bias) for name, prior in priors.items()}
-    level = False
+    level, prepared = False, None
     if "accelerometer" in priors and readings.accelerometer is not None:
         try:
-            level = tilt_rms(initialise.prepare(readings, start, lever_arm=lever_arm)[1].q) < LEAST_TILT
+            prepared = initialise.prepare(readings, start, lever_arm=lever_arm)
+            level = tilt_rms(prepared[1].q) < LEAST_TILT
         except (UnusableFlight, EstimationError) as error:
             failed[Rung.FREE] = str(error)
     rungs = [Rung.HELD] if level else [Rung.FREE, Rung.HELD]
@@ -90,7 +91,9 @@ def fit_with_fallbacks(
         try:
             if rung == Rung.INERTIAL_START:
                 own_start["magnetometer"] = magnetometer_start(readings, own_start)
-            model, state = initialise.prepare(readings, own_start, lever_arm=lever_arm)
+            if rung != Rung.FREE or prepared is None:
+                prepared = initialise.prepare(readings, own_start, lever_arm=lever_arm)
+            model, state = prepared
             free_arm = lever_arm is None and not level and rung in (Rung.FREE, Rung.INERTIAL_START)
             fit = fit_joint(model, state, try_lever_arm=free_arm, priors=own_priors)
         except (UnusableFlight, EstimationError) as error:
@@ -100,9 +103,6 @@ def fit_with_fallbacks(
         return Outcome(fit, rung, failed)
     assert first is not None
     raise first
-
-
-FailedRung = UnusableFlight | EstimationError
 
 
 def held(prior: PriorConstants) -> PriorConstants:

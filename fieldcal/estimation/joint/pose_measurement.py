@@ -119,8 +119,7 @@ class VpsRecord:
     def to_imu_clock(self, t: Array, values: Mapping[str, Array]) -> Array:
         """VPS stamps, s, on the IMU's clock."""
         lag, skew = self.clock_of(values)
-        middle = self.clock.reference_s
-        return np.asarray((t + lag - middle) / (1.0 + skew) + middle)
+        return replace(self.clock, lag_mid_s=lag, skew_ppm=1e6 * skew).to_imu_clock(t)
 
     def _read(self, model: Model, correction: Array) -> tuple[Array, np.ndarray]:
         """VPS attitude at the knots (K, 4), and which of them lie between poses no more than `max_gap_s` apart."""

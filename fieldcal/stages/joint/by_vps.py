@@ -13,10 +13,11 @@ from fieldcal.errors import EstimationError, FieldcalError, UnusableFlight
 from fieldcal.estimation.by_pose.accelerometer import fit_accelerometer
 from fieldcal.estimation.by_pose.constant_vector import fit_constant_vector
 from fieldcal.estimation.by_pose.gyroscope import fit_gyroscope, start_by_rates
-from fieldcal.estimation.by_pose.triad import CROSS_CHI2, LOWER, OFF_DIAGONAL, TriadByPose, body_axes
+from fieldcal.estimation.by_pose.triad import TriadByPose, body_axes
 from fieldcal.estimation.clock_sync import by_rates
 from fieldcal.estimation.joint.fit import JointFit
-from fieldcal.estimation.joint.problem import Readings
+from fieldcal.estimation.joint.model_selection import SCORE_CHI2
+from fieldcal.estimation.joint.problem import CROSS, Readings
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.frames import in_ned
 from fieldcal.geometry.intervals import interval_of
@@ -120,11 +121,10 @@ def estimate_by_vps(readings: Readings, poses: Poses, s: JointSettings) -> ByVps
             own_axes = rotation, uncertainty
         else:
             found = found.turned(*own_axes)
-        elements = LOWER if sensor == Sensor.ACCELEROMETER else OFF_DIAGONAL
-        test = found.cross_test(elements)
-        full = test > CROSS_CHI2[len(elements)]
+        test = found.cross_test(CROSS[sensor])
+        full = test > SCORE_CHI2[len(CROSS[sensor])]
         if not full:
-            found = found.square(np.nanmean(logged, axis=0), elements)
+            found = found.square(np.nanmean(logged, axis=0), CROSS[sensor])
         triads[sensor] = found
         measured[f"{sensor}_by_vps"] = {**numbers, "cross_axis_test": test, "cross_axis_kept": full}
     return ByVps(fit, close, triads, measured)

@@ -167,6 +167,7 @@ def passing_field_share(fit: JointFit) -> float:
 
 
 def measured_of(fit: JointFit, axes: Array) -> dict[str, Json]:
+    """The numbers that decided, and what else the fit found; `axes` (3, 3) turns sensor axes into body axes."""
     relative: dict[str, list[float]] = {}
     for name in SENSORS:
         if name in fit.layout:

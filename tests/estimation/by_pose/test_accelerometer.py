@@ -8,7 +8,8 @@ from numerics_support import rms
 
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.by_pose.accelerometer import fit_accelerometer
-from fieldcal.estimation.by_pose.triad import LOWER, TriadByPose, body_axes
+from fieldcal.estimation.by_pose.triad import TriadByPose, body_axes
+from fieldcal.estimation.joint.problem import CROSS
 from fieldcal.geometry.rotation import Array, body_from_inertial, from_rotation_vector, multiply, propagate
 from fieldcal.simulation.experiment import SimulatedFlight, constants_at, simulate
 
@@ -104,11 +105,11 @@ def test_axes_of_its_own_are_found_whatever_the_trajectory_s(flown: Flown) -> No
 
 def test_square_axes_are_the_estimate_given_zero_elements(flown: Flown) -> None:
     own, _, _ = body_axes(flown.fitted(), np.ones(3))
-    square = own.square(flown.logged.mean(axis=0), LOWER)
+    square = own.square(flown.logged.mean(axis=0), CROSS["accelerometer"])
     assert not square.matrix[np.tril_indices(3, -1)].any()
     assert square.cross_sd is None
     assert own.cross_sd is not None
-    assert own.cross_test(LOWER) > 1e3
+    assert own.cross_test(CROSS["accelerometer"]) > 1e3
     # What the elements may be stays in the sd of the diagonal.
     assert (np.diagonal(square.diagonal_covariance)[:3] >= 0.99 * np.diagonal(own.diagonal_covariance)[:3]).all()
 
