@@ -18,6 +18,7 @@ TESTS: dict[str, Sequence[str]] = {
     "logs.stamps": ("logs/test_stamps*.py",),
     "logs.tidy": ("logs/test_tidy*.py", "logs/test_stamps.py"),
     "estimation": ("estimation/test_*.py",),
+    "estimation.by_pose": ("estimation/by_pose/test_*.py",),
     "estimation.clock_sync.by_field": ("estimation/test_clock_by_field*.py",),
     "estimation.clock_sync.by_rates": ("estimation/test_clock_by_rates*.py",),
     "estimation.ellipsoid": ("estimation/test_ellipsoid*.py",),

@@ -88,6 +88,12 @@ POSITION = tuple(
 LATITUDE_DEG = Column("latitude_deg", _F64, "deg", "geodetic latitude, WGS 84, north positive")
 LONGITUDE_DEG = Column("longitude_deg", _F64, "deg", "longitude, WGS 84, east positive")
 ALTITUDE_M = Column("altitude_m", _F64, "m", "altitude as the log has it (above the ellipsoid or mean sea level)")
+GNSS_VELOCITY = (
+    Column("velocity_north_mps", _F64, "m/s", "velocity over ground from satellite navigation, north"),
+    Column("velocity_east_mps", _F64, "m/s", "the same, east"),
+    Column("velocity_down_mps", _F64, "m/s", "the same, down"),
+    Column("velocity_sd_mps", _F64, "m/s", "standard deviation that the receiver gives its speed; null: it gives none"),
+)
 CURRENT_A = Column(
     "current_a",
     _F64,

@@ -55,6 +55,14 @@ _SIGNALS = (
         (c.T_NS, c.CURRENT_A, c.THROTTLE),
         ("t_ns",),
     ),
+    Table(
+        "gnss_velocity",
+        "signal",
+        1,
+        "velocity from satellite navigation, not later than it was logged, on the log's clock",
+        (c.T_NS, *c.GNSS_VELOCITY),
+        ("t_ns",),
+    ),
 )
 
 _STAGES = (

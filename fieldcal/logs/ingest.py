@@ -17,7 +17,7 @@ import polars as pl
 from fieldcal.config.configuration import Vehicle
 from fieldcal.config.flight_settings import FlightSettings, flight_settings
 from fieldcal.errors import UnreadableLog
-from fieldcal.logs import Finding, LogReader, LogSummary, open_log
+from fieldcal.logs import SIGNAL_COLUMNS, Finding, LogReader, LogSummary, open_log
 from fieldcal.logs.discovery import folder_parts
 from fieldcal.logs.facts import Declared, Facts, FindingFacts, Judged
 from fieldcal.logs.interface import EPOCH_KNOWN_AFTER_NS
@@ -76,6 +76,8 @@ class TidyLog:
                     f"{self._name} was still being read after {self._seconds:.0f} s, {SECONDS_ALLOWED:.0f} s and 1 s "
                     "for every MB are allowed. Check the disk; the next night tries again.",
                 )
+            if table not in SIGNAL_COLUMNS:  # of a further unit
+                continue
             signal = self._signals.setdefault(table, TidySignal(table, self._held_rows))
             for frame in signal.add(columns):
                 yield table, self._seen(table, frame)

@@ -34,6 +34,13 @@ SIGNAL_COLUMNS: Mapping[str, tuple[str, ...]] = {
     "vps": ("t_ns", "qx", "qy", "qz", "qw", "px_m", "py_m", "pz_m"),
     "position": ("t_ns", "latitude_deg", "longitude_deg", "altitude_m"),
     "power": ("t_ns", "current_a", "throttle"),
+    "gnss_velocity": (
+        "t_ns",
+        "velocity_north_mps",
+        "velocity_east_mps",
+        "velocity_down_mps",
+        "velocity_sd_mps",
+    ),
 }
 
 EPOCH_KNOWN_AFTER_NS = 1_000_000_000 * 1_000_000_000
@@ -55,6 +62,50 @@ class Finding:
     fatal: bool = False
 
 
+@dataclass(frozen=True)
+class Correction:
+    """What an autopilot had done to a sensor's readings before it logged them: logged = matrix · raw + offset.
+
+    `matrix` (3, 3) and `offset` (3,), logged unit and axes on the left, nominal unit and the sensor's own axes as the
+    driver gives them on the right. Holds from `from_ns` (the log's clock) until the next of the same sensor. Where it
+    depends on temperature, `offset` is that at `temperature_degc`, and `offset_per_degc` its slope there.
+    `parameters`: those that say so, as they stand in the log.
+    """
+
+    from_ns: int
+    matrix: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    offset: tuple[float, float, float]
+    parameters: Mapping[str, float]
+    temperature_degc: float | None = None
+    offset_per_degc: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class SensorSource:
+    """One sensor of one unit on board: what it is, and where in the log its readings are.
+
+    `table`: the signal table that they come in: "imu" and "magnetometer" of the primary unit, "imu.1", "imu.2",
+    "magnetometer.1", … of the further ones. `unit_id` names the unit within the vehicle: by device id, else by frame,
+    else by instance. `stream`: message or topic, with its instance. `filtered`: low-passed, or averaged over
+    intervals, by the autopilot. `corrections`: in order of `from_ns`; empty where the readings are raw.
+    """
+
+    sensor: Sensor
+    table: str
+    unit_id: str
+    stream: str
+    rate_hz: float
+    primary: bool
+    filtered: bool = False
+    device_id: int | None = None
+    corrections: tuple[Correction, ...] = ()
+
+    @property
+    def corrected(self) -> bool:
+        """Whether the autopilot had corrected the readings."""
+        return bool(self.corrections)
+
+
 @dataclass
 class LogSummary:
     """What a log says of itself. Complete once the reader's `batches()` is exhausted.
@@ -62,7 +113,8 @@ class LogSummary:
     `units`: sensor -> unit of the delivered numbers, "unknown" when neither log nor configuration says.
     `world`, `body`, `gravity_sign`: the log's own declaration, None when it makes none.
     `epoch_known`: stamps are Unix time. `verifiable`: every delivered sample was under a checksum that held.
-    `counts`: signal table -> delivered rows. `metadata`: text pairs found in the log.
+    `counts`: signal table -> delivered rows. `metadata`: text pairs found in the log (of an autopilot: hardware,
+    firmware, board id). `sources`: where each sensor's readings came from, where one log may hold several units.
     """
 
     log_format: str
@@ -75,6 +127,7 @@ class LogSummary:
     findings: list[Finding] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
     metadata: dict[str, str] = field(default_factory=dict)
+    sources: list[SensorSource] = field(default_factory=list)
 
     def add(
         self, code: ReasonCode, count: int, sentence: str, *, loses_data: bool = False, fatal: bool = False

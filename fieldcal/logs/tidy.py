@@ -16,7 +16,7 @@ from fieldcal.logs import SIGNAL_COLUMNS, Columns, Finding, batch_frame, stamps
 from fieldcal.reason_codes import ReasonCode
 
 SENSOR_TABLES = ("imu", "magnetometer", "vps")
-MAY_BE_UNKNOWN = ("px_m", "py_m", "pz_m", "altitude_m", "current_a", "throttle")
+MAY_BE_UNKNOWN = ("px_m", "py_m", "pz_m", "altitude_m", "current_a", "throttle", "velocity_sd_mps")
 HELD_ROWS = 1 << 17
 WHOLE_ROWS_CAP = 6_000_000
 CLOCK_RESET_NS = 1_000_000_000

@@ -136,6 +136,7 @@ FORMS = {
     "vps": (1, "a8342131"),
     "position": (1, "af486156"),
     "power": (1, "8f471e07"),
+    "gnss_velocity": (1, "a284e9ae"),
     "faults": (1, "a52b66de"),
     "segments": (1, "00bc3bfc"),
     "samples": (1, "ff1cc6e0"),
