@@ -74,6 +74,7 @@ class Method(StrEnum):
     ELLIPSOID_TWO_STEP = "ellipsoid_two_step"
     ELLIPSOID_TLS = "ellipsoid_tls"
     WARM_UP = "warm_up"
+    MOTOR_FIELD = "motor_field"
 
 
 PREFERRED_METHODS = (

@@ -252,6 +252,8 @@ class ReasonCode(StrEnum):
     """The clocks' correlation has no clear peak."""
     AMBIGUOUS_PEAK = "ambiguous_peak"
     """The clocks' correlation has two peaks alike."""
+    CLOCK_RATES_DIFFER = "clock_rates_differ"
+    """IMU and VPS show one motion on clocks of different rates: the stamps of one are wrong."""
     NOT_THE_SAME_MOTION = "not_the_same_motion"
     """VPS and gyroscope saw different motions."""
     VPS_TOO_SHORT = "vps_too_short"

@@ -217,7 +217,7 @@ class Configuration:
         table = _laid_over(self.document.defaults, self.document.vehicles.get(vehicle_id, VehicleTable()))
         given = {
             "imu_id": table.imu_id or vehicle_id,
-            "method": dict.fromkeys(SENSORS, Approach.SERIAL) | table.method,
+            "method": dict.fromkeys(SENSORS, Approach.AUTO) | table.method,
             "polarity": dict.fromkeys(SENSORS, (1, 1, 1)) | table.polarity,
             "parameters": _with_presets(table.parameters, table.profile),
         }

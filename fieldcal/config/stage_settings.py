@@ -293,6 +293,7 @@ class ChoiceSettings(Axes):
     """Stage `choice`."""
 
     method: Mapping[Sensor, Approach]
+    field_ned: Triple
 
 
 # --- from a flight's settings, and to and from the plain JSON of a record

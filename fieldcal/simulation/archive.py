@@ -151,6 +151,9 @@ def signals(r: SimulatedFlight) -> dict[str, pl.DataFrame]:
         ),
         "temperature": pl.DataFrame({"t_ns": t_ns, "temperature_degc": r.temperature}),
     }
+    if r.current_a is not None:
+        nothing = pl.lit(None, pl.Float64).alias("throttle")
+        out["power"] = pl.DataFrame({"t_ns": t_ns, "current_a": r.current_a}).with_columns(nothing)
     if len(r.vps_t):
         pose = np.hstack([r.vps_q, r.vps_position])
         vps_ns = np.rint(r.vps_t * 1e9).astype(np.int64)

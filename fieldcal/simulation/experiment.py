@@ -89,7 +89,7 @@ class SimulatedFlight:
     """A simulated log and its truth.
 
     Logged: `t` (n,) IMU stamps, s; `counts` sensor → (n, 3); `temperature` (n,) °C; `vps_t` (m,) s on the VPS clock;
-    `vps_q` (m, 4) body to NED world; `vps_position` (m, 3) m.
+    `vps_q` (m, 4) body to NED world; `vps_position` (m, 3) m; `current_a` (n,) A of the motors, or None.
     Truth: `q` (n, 4) and `rate` (n, 3) at t as the sensors saw them, i.e. `delay_s` late by the sensor filter; the two
     constant VPS rotations.
 
@@ -112,6 +112,7 @@ class SimulatedFlight:
     delay_s: float
     vps_world_rotation: Array
     vps_body_rotation: Array
+    current_a: Array | None = None
 
     def lag_at(self, imu_time_s: float) -> float:
         """VPS clock + lag = IMU clock, s, at an IMU time; the sensors' delay is in it."""

@@ -14,6 +14,7 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import SENSORS, Approach, Json, Method, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables
+from fieldcal.stages.motor_field import allow_for_motor_field
 from fieldcal.stages.results import StageResult, fatal_fault
 from fieldcal.stages.tables import AXES, calibration_rows, constants, matrix, seconds, triad
 from fieldcal.stages.vps import RATE_COLUMNS, bridged
@@ -38,7 +39,11 @@ def choose(tables: Tables, s: ChoiceSettings) -> StageResult:
             status=Status.REFUSED, reason_code=ReasonCode.NOTHING_CALIBRATED, reason="No method gave constants."
         )
     rows = pl.concat(parts)
+    if "motor_faults" in tables:
+        rows = _with_motor_field(rows, tables["motor_faults"], float(np.linalg.norm(s.field_ned)))
     measured: dict[str, Json] = {}
+    for name in ("vps_faults", "joint_faults"):
+        rows = _of_wrong_clocks(rows, tables.get(name))
     against = _contradicted(rows, tables, s)
     measured["scale_by_vps"] = {method: [list(pair) for pair in pairs] for method, pairs in against.items()}
     for method, pairs in against.items():
@@ -52,7 +57,7 @@ def choose(tables: Tables, s: ChoiceSettings) -> StageResult:
     for sensor in SENSORS:
         if s.method[sensor] != Approach.AUTO:
             continue
-        own = rows.filter(sensor=sensor)
+        own = rows.filter(sensor=sensor, parameter="scale")
         methods = own["method"].unique().to_list()
         if Method.JOINT not in methods:
             chosen[sensor] = Approach.SERIAL
@@ -70,6 +75,24 @@ def choose(tables: Tables, s: ChoiceSettings) -> StageResult:
             chosen[sensor] = Approach.JOINT
     measured["chosen"] = chosen
     return StageResult({"calibration": rows}, measured=measured)
+
+
+def _of_wrong_clocks(rows: pl.DataFrame, faults: pl.DataFrame | None) -> pl.DataFrame:
+    """Every method's gyroscope refused where the VPS shows that the stamps are not seconds."""
+    code = ReasonCode.CLOCK_RATES_DIFFER
+    if faults is None or faults.filter(reason_code=str(code)).is_empty():
+        return rows
+    return _refused(rows, Sensor.GYROSCOPE, rows["method"].unique().to_list(), None, code)
+
+
+def _with_motor_field(rows: pl.DataFrame, faults: pl.DataFrame, strength: float) -> pl.DataFrame:
+    """The joint magnetometer's rows with what the motors may have spoilt; the ellipsoid's have it already."""
+    found = faults.filter(reason_code=str(ReasonCode.MOTOR_FIELD))
+    if found.is_empty():
+        return rows
+    own = (pl.col("sensor") == Sensor.MAGNETOMETER) & (pl.col("method") == Method.JOINT)
+    widened = allow_for_motor_field(rows.filter(own), float(found["number"][0]), strength)
+    return pl.concat([rows.filter(~own), widened])
 
 
 def _refused(

@@ -68,6 +68,23 @@ def check_motor_field(tables: Tables, s: VectorsSettings) -> tuple[dict[str, Jso
     return {}, []
 
 
+def allow_for_motor_field(rows: pl.DataFrame, share: float, strength: float) -> pl.DataFrame:
+    """Magnetometer rows whose sd allows for a field of `share` times the local one that follows the motors' current: a
+    fit with constant parameters may absorb all of it in scale or bias without a larger residual."""
+    of_axis = rows.filter(pl.col("parameter") == "scale").select("method", "axis", scale=pl.col("value").abs())
+    could_err = (
+        pl.when(pl.col("parameter") == "scale")
+        .then(share * pl.col("scale"))
+        .when(pl.col("parameter") == "zero")
+        .then(share * strength / pl.col("scale"))
+        .when(pl.col("parameter").is_in(["bias", "zero_bias"]))
+        .then(share * strength)
+        .otherwise(0.0)
+    )
+    joined = rows.join(of_axis, on=["method", "axis"], how="left", maintain_order="left")
+    return joined.with_columns(sd=(pl.col("sd") ** 2 + could_err**2).sqrt()).select(rows.columns)
+
+
 def _approximate(tables: Tables, s: VectorsSettings, values: Array) -> tuple[Array, Array] | None:
     """Scale and bias to start from: the magnetometer's, of a refused fit too (the current may be why it was refused),
     else the algebraic fit's; what is wrong with them is fitted together with the current's field."""

@@ -251,7 +251,7 @@ PIPELINE: tuple[Stage, ...] = (
             **FAULTS,
         },
         ("imu",),
-        ("sync", "vps_aligned"),
+        ("sync", "vps_aligned", "faults"),
         (Sensor.GYROSCOPE,),
     ),
     _stage(
@@ -282,7 +282,9 @@ PIPELINE: tuple[Stage, ...] = (
             "gyroscope": "gyro_output.calibration",  # equation error's rows too
             "joint": "joint.calibration",
             "joint_faults": "joint.faults",
+            "motor_faults": "vectors.faults",
             "vps_aligned": "vps_sync.vps_aligned",
+            "vps_faults": "vps_sync.faults",
             "fit": "verify.fit",
         },
         (),

@@ -134,6 +134,38 @@ def triad_rows(
     return rows
 
 
+def quantity_rows(
+    sensor: Sensor,
+    method: Method,
+    parameter: str,
+    axes: Sequence[str],
+    value: ArrayLike,
+    sd: ArrayLike,
+    *,
+    unit: str,
+    temperature_degc: float | None,
+    reason_code: Sequence[ReasonCode | None] | None = None,
+) -> list[CalibrationRow]:
+    """Rows of a parameter beside scale and zero: an axis ("" where it has none), value and sd each; one with a reason
+    code is refused."""
+    codes = [None] * len(axes) if reason_code is None else reason_code
+    return [
+        {
+            "sensor": sensor,
+            "method": method,
+            "parameter": parameter,
+            "axis": axis,
+            "value": float(own),
+            "sd": float(own_sd),
+            "unit": unit,
+            "temperature_degc": temperature_degc,
+            "status": Status.REFUSED if code else Status.OK,
+            "reason_code": code,
+        }
+        for axis, own, own_sd, code in zip(axes, np.asarray(value), np.asarray(sd), codes, strict=True)
+    ]
+
+
 def zero_slope_rows(
     sensor: Sensor,
     method: Method,
@@ -146,22 +178,17 @@ def zero_slope_rows(
 ) -> list[CalibrationRow]:
     """Rows zero_per_degc of one triad: slope (3,) of its zero on temperature and sd (3,), logged units per °C; an axis
     with a reason code is refused."""
-    unit = f"({logged_unit})/degC" if "/" in logged_unit else f"{logged_unit}/degC"
-    return [
-        {
-            "sensor": sensor,
-            "method": method,
-            "parameter": ZERO_SLOPE,
-            "axis": axis,
-            "value": float(value),
-            "sd": float(own_sd),
-            "unit": unit,
-            "temperature_degc": temperature_degc,
-            "status": Status.REFUSED if code else Status.OK,
-            "reason_code": code,
-        }
-        for axis, value, own_sd, code in zip(AXES, np.asarray(slope), np.asarray(sd), reason_code, strict=True)
-    ]
+    return quantity_rows(
+        sensor,
+        method,
+        ZERO_SLOPE,
+        AXES,
+        slope,
+        sd,
+        unit=f"({logged_unit})/degC" if "/" in logged_unit else f"{logged_unit}/degC",
+        temperature_degc=temperature_degc,
+        reason_code=reason_code,
+    )
 
 
 @overload

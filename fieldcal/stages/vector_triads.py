@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import polars as pl
@@ -25,9 +26,9 @@ from fieldcal.stages.inputs import (
     reference_reading,
     refusal,
 )
-from fieldcal.stages.motor_field import check_motor_field
-from fieldcal.stages.results import StageResult, fatal_fault, fault_rows, triad_rows
-from fieldcal.stages.tables import calibration_rows, constants, covariance_table, matrix, seconds, triad
+from fieldcal.stages.motor_field import allow_for_motor_field, check_motor_field
+from fieldcal.stages.results import StageResult, fatal_fault, fault_rows, quantity_rows, triad_rows
+from fieldcal.stages.tables import AXES, calibration_rows, constants, covariance_table, matrix, seconds, triad
 
 if TYPE_CHECKING:
     from fieldcal.config.stage_settings import (
@@ -223,19 +224,21 @@ def _lever_arm(samples: pl.DataFrame, rate: Array, arm_m: Triple, window_s: floa
     return sensor_model.lever_arm_acceleration(rate, rate_dot, arm_m)
 
 
-def _with_motor_field(rows: pl.DataFrame, share: float, strength: float) -> pl.DataFrame:
-    """Magnetometer rows whose sd allows for a field of `share` times the local one that follows the motors' current: a
-    fit with constant parameters may absorb all of it in scale or bias without a larger residual."""
-    of_axis = rows.filter(pl.col("parameter") == "scale").select("method", "axis", scale=pl.col("value").abs())
-    could_err = (
-        pl.when(pl.col("parameter") == "scale")
-        .then(share * pl.col("scale"))
-        .when(pl.col("parameter") == "zero")
-        .then(share * strength / pl.col("scale"))
-        .otherwise(share * strength)
+def _motor_rows(measured: Mapping[str, Json], tables: Tables, s: VectorsSettings) -> pl.DataFrame:
+    """What the motors' current, or the throttle, adds to the magnetometer's readings, as rows of the history."""
+    found = cast(dict[str, list[float] | str], measured["motor_field"])
+    drive = "current" if found["drive"] == "current_a" else "throttle"
+    rows = quantity_rows(
+        Sensor.MAGNETOMETER,
+        Method.MOTOR_FIELD,
+        f"field_per_{drive}",
+        AXES,
+        cast(list[float], found["slope"]),
+        cast(list[float], found["slope_sd"]),
+        unit=f"{s.field_unit}/A" if drive == "current" else s.field_unit,
+        temperature_degc=tables["magnetometer"]["temperature_degc"][0] if "magnetometer" in tables else None,
     )
-    joined = rows.join(of_axis, on=["method", "axis"], how="left", maintain_order="left")
-    return joined.with_columns(sd=(pl.col("sd") ** 2 + could_err**2).sqrt()).select(rows.columns)
+    return calibration_rows(rows)
 
 
 def judge_vectors(tables: Tables, s: VectorsSettings) -> StageResult:
@@ -257,9 +260,11 @@ def judge_vectors(tables: Tables, s: VectorsSettings) -> StageResult:
             code = pl.when(pl.col("status") == Status.OK).then(pl.lit(fault["reason_code"])).otherwise("reason_code")
             parts.append(tables[name].with_columns(status=pl.lit(Status.REFUSED), reason_code=code))
         elif name == Sensor.MAGNETOMETER and motor is not None:
-            parts.append(_with_motor_field(tables[name], motor.value, float(np.linalg.norm(s.field_ned))))
+            parts.append(allow_for_motor_field(tables[name], motor.value, float(np.linalg.norm(s.field_ned))))
         else:
             parts.append(tables[name])
+    if "motor_field" in measured:
+        parts.append(_motor_rows(measured, tables, s))
     if not parts:
         return StageResult(
             status=Status.ABSENT, reason_code=ReasonCode.NO_VECTORS, reason="Neither vector triad was calibrated."

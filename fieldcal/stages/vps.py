@@ -11,6 +11,7 @@ from fieldcal.errors import UnusableFlight
 from fieldcal.estimation import smoothing
 from fieldcal.estimation.clock_sync import by_rates
 from fieldcal.estimation.clock_sync.by_field import refine_by_field
+from fieldcal.estimation.faults import Fault
 from fieldcal.estimation.wahba import rotation_between
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.frames import FRD_FROM_FLU_QUATERNION, NED_FROM_ENU_QUATERNION
@@ -31,7 +32,7 @@ from fieldcal.names import Json, Method, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Tables, is_sound
-from fieldcal.stages.results import StageResult
+from fieldcal.stages.results import StageResult, fault_rows
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, constants, matrix, seconds, triad
 
 if TYPE_CHECKING:
@@ -88,7 +89,11 @@ def synchronise_vps(tables: Tables, s: VpsSyncSettings) -> StageResult:
         row = _sync_row(
             {"status": Status.REFUSED, "peak": error.measured.get("peak"), "runner_up": error.measured.get("runner_up")}
         )
-        return StageResult({"sync": row}, Status.REFUSED, error.reason_code, str(error), {**measured, **error.measured})
+        found = {"sync": row}
+        if error.reason_code == ReasonCode.CLOCK_RATES_DIFFER:
+            fault = Fault(Sensor.GYROSCOPE, "", error.reason_code, 0.0, 0.0, True, str(error))
+            found["faults"] = fault_rows([fault])
+        return StageResult(found, Status.REFUSED, error.reason_code, str(error), {**measured, **error.measured})
     fit, by_field = _refined(fit, tables, s, origin, t_vps, q_vps)
     measured |= by_field
     row = _sync_row(

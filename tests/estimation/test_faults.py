@@ -150,13 +150,16 @@ def flown() -> tuple[np.ndarray, Readings]:
     return signals(recording)["imu"]["t_ns"].to_numpy(), si
 
 
-def calibrated(t_ns: np.ndarray, readings: Readings, units: dict[str, str] | None = None) -> dict[str, StageResult]:
+def calibrated(
+    t_ns: np.ndarray, readings: Readings, units: dict[str, str] | None = None, method: str = "auto"
+) -> dict[str, StageResult]:
     imu = np.hstack([readings["gyroscope"], readings["accelerometer"]])
     tables = {
         "imu": pl.DataFrame({"t_ns": t_ns, **columns_of(imu, triad("gyroscope") + triad("accelerometer"))}),
         "magnetometer": pl.DataFrame({"t_ns": t_ns, **columns_of(readings["magnetometer"], triad("magnetometer"))}),
     }
-    return run_flight(tables, flight_settings(vehicle(), units={**UNITS, **(units or {})}))
+    settings = flight_settings(vehicle(), units={**UNITS, **(units or {})})
+    return run_flight(tables, settings.changed(method=method))
 
 
 def good(results: dict[str, StageResult]) -> set[tuple[str, str]]:
@@ -299,10 +302,11 @@ CASES: dict[str, tuple[Change, set[tuple[str, str]], set[str]]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_no_insane_recording_is_called_good(flown: tuple[np.ndarray, Readings], case: str) -> None:
+@pytest.mark.parametrize("method", ["serial", "auto"])
+def test_no_insane_recording_is_called_good(flown: tuple[np.ndarray, Readings], case: str, method: str) -> None:
     t_ns, readings = flown
     change, not_good, reasons = CASES[case]
-    results = calibrated(t_ns, {**readings, **change(readings)})
+    results = calibrated(t_ns, {**readings, **change(readings)}, method=method)
     assert not good(results) & not_good
     assert told(results) & reasons, told(results)
     assert all(result.status != "failed" for result in results.values())

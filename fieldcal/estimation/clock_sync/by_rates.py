@@ -36,6 +36,7 @@ FINE_CUTOFF_HZ = 8.0
 REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock
 # Chance peaks of unrelated motions reach 0.9 in the coarse correlation; the vector fit tells them apart.
 MIN_EXPLAINED, MAX_SKEW_PPM, MAX_LAG_SD_S = 0.6, 2000.0, 0.01
+SURELY_EXPLAINED = 0.9  # share from which an impossible clock, not another motion, is what differs
 
 
 @dataclass(frozen=True)
@@ -230,7 +231,7 @@ def synchronise(
     ------
     UnusableFlight
         `vps_too_short`, `flat_peak` (peak below `min_peak`), `ambiguous_peak` (runner-up within 2 % of the peak),
-        `not_the_same_motion` (the vector fit fails at the best lag); `measured` has the numbers.
+        `clock_rates_differ`, `not_the_same_motion` (the vector fit fails at the best lag); `measured` has the numbers.
 
     Notes
     -----
@@ -261,6 +262,15 @@ def synchronise(
         )
     fit = _refine(imu, vps, lag, float(t_imu[0]), 0.5 * float(t_imu[0] + t_imu[-1]), measured)
     measured |= {"explained": fit.explained, "skew_ppm": fit.skew_ppm, "lag_sd_s": fit.lag_sd_s}
+    if fit.explained >= SURELY_EXPLAINED and abs(fit.skew_ppm) > MAX_SKEW_PPM and fit.lag_sd_s <= MAX_LAG_SD_S:
+        raise UnusableFlight(
+            ReasonCode.CLOCK_RATES_DIFFER,
+            f"The IMU and the VPS show the same motion ({100 * fit.explained:.0f} % of the variance) on clocks whose"
+            f" rates differ by {1e-4 * abs(fit.skew_ppm):.2f} %, the VPS's is the"
+            f" {'fast' if fit.skew_ppm > 0 else 'slow'} one: the stamps, or the sample rate that they were made from,"
+            " are wrong on one side, and the gyroscope's scale by as much. Correct them.",
+            measured,
+        )
     if fit.explained < MIN_EXPLAINED or abs(fit.skew_ppm) > MAX_SKEW_PPM or fit.lag_sd_s > MAX_LAG_SD_S:
         raise UnusableFlight(
             ReasonCode.NOT_THE_SAME_MOTION,

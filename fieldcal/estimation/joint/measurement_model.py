@@ -246,6 +246,11 @@ def _turned_by_gyroscope(
             integrand[:, at + k] = r_nb[:, axis] * (scale[axis] * x[other])
     if "gyroscope_temperature" in layout and model.readings.warmth is not None:
         integrand[:, layout["gyroscope_temperature"]] = r_nb * (scale[:, None] * model.readings.warmth[reach])
+    if "gyroscope_g_sensitivity" in layout and model.readings.force is not None:
+        at, force = layout["gyroscope_g_sensitivity"].start, model.readings.force[reach].T
+        for axis in range(3):
+            for other in range(3):
+                integrand[:, at + 3 * axis + other] = r_nb[:, axis] * (scale[axis] * force[other])
     area = integrand[..., 1:] + integrand[..., :-1]
     area *= 0.5 * np.diff(t[reach])
     total = np.zeros_like(integrand)

@@ -1,7 +1,11 @@
 """Optional terms of the joint estimate, each included only where it predicts held-out data better.
 
+A term that the score shows and the prediction does not is left out, and what it would move the constants by is in their
+covariance: one of the two is wrong about it.
+
 Cross-axis terms (a triad whose axes are not quite orthogonal or not quite the accelerometer's; soft iron), a delay of a
-vector triad behind the gyroscope, and the gyroscope's slope with temperature. On data without the effect each costs
+vector triad behind the gyroscope, the gyroscope's slope with temperature, and, where a VPS tells the attitude, its
+sensitivity to specific force. On data without the effect each costs
 accuracy, so a term must pass two tests: a score test on the whole record (cheap, no fit); then constants fitted on the
 first part of the record with and without the term predict the readings of the rest, where only attitude and translation
 are free.
@@ -32,6 +36,7 @@ LEAST_GAIN_SD, BLOCK_S, FEWEST_BLOCKS = 3.0, 2.0, 6
 FIT_SHARE = 0.6  # of the record; the rest is held out
 PREDICT_ITERATIONS, PREDICT_STEP_RAD = 10, 1e-6  # most iterations, and the step at which they end
 LEAST_TEMPERATURE_RANGE_DEGC = 1.0
+LEAST_FORCE_MPS2 = 2.0  # rms about the mean; below it gravity hardly turned in the sensor's axes
 LEAST_RATE_RADPS = 0.2  # rms: below it a delay does nothing
 
 
@@ -47,7 +52,7 @@ class TermTest:
 
 def add_terms(fit: JointFit) -> tuple[JointFit, list[TermTest]]:
     """The fit with the optional terms that pass both tests, and the result of the tests."""
-    scores = _scores(fit) if candidates(fit) else {}
+    scores, moved = _scores(fit) if candidates(fit) else ({}, {})
     over = {name: score / SCORE_CHI2[TERMS[name]] for name, score in scores.items()}
     tried = sorted((name for name in over if over[name] > 1.0), key=lambda name: -over[name])
     gains = _gains(fit, tried) if tried else {}
@@ -57,7 +62,19 @@ def add_terms(fit: JointFit) -> tuple[JointFit, list[TermTest]]:
             fit = with_terms(fit, kept)
         except EstimationError:
             kept = []
+    fit = _doubted(fit, [moved[name] for name in tried if name not in kept])
     return fit, [TermTest(name, score, gains.get(name), name in kept) for name, score in scores.items()]
+
+
+def _doubted(fit: JointFit, moved: list[dict[str, Array]]) -> JointFit:
+    """The fit with these changes of its parameters, by name, in the covariance."""
+    covariance = fit.covariance.copy()
+    for change in moved:
+        by = np.zeros(len(covariance))
+        for name, values in change.items():
+            by[fit.layout[name]] = values
+        covariance += np.outer(by, by)
+    return replace(fit, covariance=covariance)
 
 
 def with_terms(fit: JointFit, names: list[str]) -> JointFit:
@@ -72,6 +89,10 @@ def candidates(fit: JointFit) -> list[str]:
     out = ["gyroscope_cross"] if len(fit.model.vectors) == 2 else []
     if readings.warmth is not None and float(np.ptp(readings.warmth)) > LEAST_TEMPERATURE_RANGE_DEGC:
         out.append("gyroscope_temperature")
+    # Vectors alone can't tell it: the same accelerometer would be both the cause and the witness.
+    force = None if fit.vps is None else readings.force
+    if force is not None and float(np.sqrt(np.mean(np.sum(force**2, axis=1)))) > LEAST_FORCE_MPS2:
+        out.append("gyroscope_g_sensitivity")
     if float(np.sqrt(np.mean(np.sum(fit.path.rate**2, axis=1)))) > LEAST_RATE_RADPS:
         out += [f"{name}_delay" for name in fit.model.vectors]
     return out + [f"{name}_cross" for name in fit.model.vectors]
@@ -97,9 +118,9 @@ def _refitted(
     )
 
 
-def _scores(fit: JointFit) -> dict[str, float]:
+def _scores(fit: JointFit) -> tuple[dict[str, float], dict[str, dict[str, Array]]]:
     """χ² of each candidate's first step, with all candidates free and the other parameters following; `fit` is at its
-    optimum."""
+    optimum. By candidate, if it were free alone: what its first step moves the other parameters by, by name."""
     names = candidates(fit)
     model, state = fit.model, with_zeros(fit.state, names)
     layout, p = layout_of(model, state.values, dip="dip" in fit.layout, lever_arm="lever_arm" in fit.layout)
@@ -117,12 +138,20 @@ def _scores(fit: JointFit) -> dict[str, float]:
     )
     covariance = np.linalg.pinv(left, rcond=1e-6, hermitian=True)
     step = covariance @ (gradient[tested, GRADIENT] * scale[tested])
-    out, at = {}, 0
+    out: dict[str, float] = {}
+    moved: dict[str, dict[str, Array]] = {}
+    at = 0
     for name in names:
         these = slice(at, at + TERMS[name])
         out[name] = float(step[these] @ np.linalg.lstsq(covariance[these, these], step[these], rcond=1e-10)[0])
+        own = np.arange(p)[layout[name]]
+        follow = np.linalg.lstsq(unit[np.ix_(rest, rest)], unit[np.ix_(rest, own)], rcond=1e-10)[0]
+        alone = np.linalg.pinv(left[these, these], rcond=1e-6, hermitian=True) @ (gradient[own, GRADIENT] * scale[own])
+        by = np.zeros(p)
+        by[rest] = -scale[rest] * (follow @ alone)
+        moved[name] = {other: by[layout[other]] for other in fit.layout}
         at = these.stop
-    return out
+    return out, moved
 
 
 def _gains(fit: JointFit, names: list[str]) -> dict[str, float]:

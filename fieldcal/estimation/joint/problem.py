@@ -18,11 +18,13 @@ TRIADS = ("gyroscope", "accelerometer", "magnetometer")
 # Off-diagonal elements of a triad's matrix that are free: body axes are the accelerometer's, whose x stays where it is.
 OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 CROSS = {"gyroscope": OFF_DIAGONAL, "accelerometer": ((1, 0), (2, 0), (2, 1)), "magnetometer": OFF_DIAGONAL}
-# Optional parameters and their sizes: cross-axis terms, the gyroscope's slope with temperature, delays of the vector
-# triads behind it, s (`model_selection`); then the clock and the mounting of a VPS (`pose_measurement`).
+# Optional parameters and their sizes: cross-axis terms, the gyroscope's slope with temperature and its sensitivity to
+# specific force, delays of the vector triads behind it, s (`model_selection`); then the clock and the mounting of a VPS
+# (`pose_measurement`).
 TERMS = {
     "gyroscope_cross": 6,
     "gyroscope_temperature": 3,
+    "gyroscope_g_sensitivity": 9,
     "accelerometer_delay": 1,
     "magnetometer_delay": 1,
     "accelerometer_cross": 3,
@@ -38,7 +40,9 @@ class Readings:
     `t` (n,) s; `segment` (n,) contiguous stretches; `gyroscope` (n, 3) complete; `accelerometer`, `magnetometer` (n, 3)
     with NaN where there is no reading, or None; `gravity_mps2` signed: negative for a specific-force accelerometer;
     `field_ned` (3,) the configured local field; `turning` (2, n, 3) the gyroscope low-passed and its derivative, logged
-    units (for the lever arm); `warmth` (n,) temperature less its mean, °C, or None."""
+    units (for the lever arm); `warmth` (n,) temperature less its mean, °C, or None; `force` (n, 3) specific force
+    less its mean, m/s², by an accelerometer known to some per cent, or None (for the gyroscope's sensitivity to it: its
+    zero is then that at the mean force, as it is without the term)."""
 
     t: Array
     segment: np.ndarray
@@ -49,6 +53,7 @@ class Readings:
     field_ned: Array
     turning: Array
     warmth: Array | None = None
+    force: Array | None = None
 
     def part(self, samples: slice) -> Readings:
         """These samples alone."""
@@ -65,6 +70,7 @@ class Readings:
             magnetometer=cut(self.magnetometer),
             turning=self.turning[:, samples],
             warmth=cut(self.warmth),
+            force=cut(self.force),
         )
 
     def gyroscope_alone(self) -> Readings:
@@ -203,8 +209,8 @@ class Model:
 
 
 def corrected(model: Model, values: Mapping[str, Array], name: str, span: slice = slice(None)) -> Array:
-    """Readings of a triad, (m, 3), with the optional terms applied to x: (I + E) x + slope × temperature; Λ' and b'
-    follow."""
+    """Readings of a triad, (m, 3), with the optional terms applied to x: (I + E) x + slope × temperature + G × force;
+    Λ' and b' follow."""
     x = model.triads[name].x[span]
     out = x
     cross = values.get(f"{name}_cross")
@@ -213,6 +219,9 @@ def corrected(model: Model, values: Mapping[str, Array], name: str, span: slice 
     slope = values.get(f"{name}_temperature")
     if slope is not None and model.readings.warmth is not None:
         out = out + model.readings.warmth[span, None] * slope
+    sensitivity = values.get(f"{name}_g_sensitivity")
+    if sensitivity is not None and model.readings.force is not None:
+        out = out + model.readings.force[span] @ sensitivity.reshape(3, 3).T
     return out
 
 

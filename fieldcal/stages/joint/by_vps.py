@@ -4,7 +4,7 @@ trajectory that this gives. What the vectors could add to the attitude is less t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +13,7 @@ from fieldcal.errors import EstimationError, FieldcalError, UnusableFlight
 from fieldcal.estimation.by_pose.accelerometer import fit_accelerometer
 from fieldcal.estimation.by_pose.constant_vector import fit_constant_vector
 from fieldcal.estimation.by_pose.gyroscope import fit_gyroscope, start_by_rates
+from fieldcal.estimation.by_pose.level import mean_in_world, ned_from_world
 from fieldcal.estimation.by_pose.triad import TriadByPose, body_axes
 from fieldcal.estimation.clock_sync import by_rates
 from fieldcal.estimation.joint.fit import JointFit
@@ -21,19 +22,20 @@ from fieldcal.estimation.joint.problem import CROSS, Readings
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.frames import in_ned
 from fieldcal.geometry.intervals import interval_of
-from fieldcal.geometry.rotation import Array, body_from_inertial, continuous, to_rotation_vector
+from fieldcal.geometry.rotation import Array, body_from_inertial, continuous, slerp, to_rotation_vector
 from fieldcal.names import VECTOR_SENSORS, Json, Sensor
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import sensor_attitude
 from fieldcal.stages.inputs import Tables
+from fieldcal.stages.joint.judgement import MAX_DIP_DIFFERENCE_DEG
 from fieldcal.stages.tables import QUATERNION, matrix, seconds
 from fieldcal.stages.vps import vps_attitude
 
 if TYPE_CHECKING:
     from fieldcal.config.stage_settings import JointSettings
 
-# Of the field's dip from the configured one: more is a wrong place. A VPS's world may be out of level by some degrees.
-MAX_DIP_DIFFERENCE_DEG = 20.0
+# A triad's delay is refined until it changes by less; one that is longer is none, but another motion.
+CONVERGED_DELAY_S, LONGEST_DELAY_S, MOST_DELAY_ROUNDS = 1e-3, 0.5, 6
 POSITION = ("px_m", "py_m", "pz_m")
 
 
@@ -52,12 +54,13 @@ class Poses:
 @dataclass(frozen=True)
 class ByVps:
     """What the VPS determines: `fit` of the gyroscope, `close` of trajectory, clock and mounting; `triads` of the
-    vector sensors in axes of the accelerometer's own (of the gyroscope's, without one), or why there is none; and the
-    numbers."""
+    vector sensors in axes of the accelerometer's own (of the gyroscope's, without one), or why there is none; `world`
+    (4,): from the VPS's world to NED; and the numbers."""
 
     fit: JointFit
     close: JointFit
     triads: Mapping[Sensor, TriadByPose | FieldcalError]
+    world: Array
     measured: Mapping[str, Json]
 
 
@@ -107,15 +110,17 @@ def estimate_by_vps(readings: Readings, poses: Poses, s: JointSettings) -> ByVps
     triads: dict[Sensor, TriadByPose | FieldcalError] = {}
     measured = _measured(close, poses)
     own_axes: tuple[Array, Array] = np.eye(3), np.zeros((3, 3))
+    in_world: dict[Sensor, Array] = {}
     for sensor in VECTOR_SENSORS[::-1]:  # the accelerometer first: the body axes are its own
         logged = readings.accelerometer if sensor == Sensor.ACCELEROMETER else readings.magnetometer
         if logged is None:
             continue
         try:
-            found, numbers = _vector_triad(sensor, logged, readings, close, poses, known, at, s)
+            found, numbers = _on_its_own_clock(sensor, logged, readings, close, poses, known, at, s)
         except (UnusableFlight, EstimationError) as error:
             triads[sensor] = error
             continue
+        in_world[sensor] = mean_in_world(close.path.q[known], (logged @ found.matrix.T + found.bias)[known])
         if sensor == Sensor.ACCELEROMETER:
             found, rotation, uncertainty = body_axes(found, s.polarity[sensor])
             own_axes = rotation, uncertainty
@@ -127,10 +132,16 @@ def estimate_by_vps(readings: Readings, poses: Poses, s: JointSettings) -> ByVps
             found = found.square(np.nanmean(logged, axis=0), CROSS[sensor])
         triads[sensor] = found
         measured[f"{sensor}_by_vps"] = {**numbers, "cross_axis_test": test, "cross_axis_kept": full}
-    return ByVps(fit, close, triads, measured)
+    down = in_world.get(Sensor.ACCELEROMETER)
+    world = ned_from_world(
+        None if down is None else np.sign(readings.gravity_mps2) * down,
+        in_world.get(Sensor.MAGNETOMETER),
+        readings.field_ned,
+    )
+    return ByVps(fit, close, triads, world, measured)
 
 
-def _vector_triad(
+def _on_its_own_clock(
     sensor: Sensor,
     logged: Array,
     readings: Readings,
@@ -140,7 +151,32 @@ def _vector_triad(
     at: Array,
     s: JointSettings,
 ) -> tuple[TriadByPose, dict[str, Json]]:
-    """One vector triad by the trajectory, and the numbers that stand for it."""
+    """`_vector_triad`, anew with the trajectory of when the triad sensed it, until its delay changes no more: the delay
+    is linear only while the vehicle turns little within it."""
+    late = 0.0
+    for _ in range(MOST_DELAY_ROUNDS):
+        then = replace(readings, t=readings.t - late)
+        q = slerp(readings.t, fit.path.q, then.t) if late else fit.path.q
+        found, numbers = _vector_triad(sensor, logged, then, q, fit, poses, known, at, s)
+        late, before = late + found.delay_s, late
+        if abs(late - before) < CONVERGED_DELAY_S or abs(late) > LONGEST_DELAY_S:
+            break
+    found = replace(found, delay_s=late)
+    return found, {**numbers, "delay_s": late}
+
+
+def _vector_triad(
+    sensor: Sensor,
+    logged: Array,
+    readings: Readings,
+    q: Array,
+    fit: JointFit,
+    poses: Poses,
+    known: np.ndarray,
+    at: Array,
+    s: JointSettings,
+) -> tuple[TriadByPose, dict[str, Json]]:
+    """One vector triad by attitudes q (n, 4) at the readings' stamps, and the numbers that stand for it."""
     assert fit.vps is not None
     by_position = sensor == Sensor.ACCELEROMETER and bool(np.isfinite(poses.position).any())
     numbers: dict[str, Json] = {"by": "attitude and position" if by_position else "attitude"}
@@ -150,7 +186,7 @@ def _vector_triad(
             readings.t,
             readings.segment,
             logged,
-            fit.path.q,
+            q,
             at,
             poses.position @ turn,
             gravity_mps2=readings.gravity_mps2,
@@ -162,7 +198,7 @@ def _vector_triad(
             abs(readings.gravity_mps2) if sensor == Sensor.ACCELEROMETER else float(np.linalg.norm(readings.field_ned))
         )
         found, vector, _ = fit_constant_vector(
-            readings.t, readings.segment, logged, fit.path.q, known, length=length, polarity=s.polarity[sensor]
+            readings.t, readings.segment, logged, q, known, length=length, polarity=s.polarity[sensor]
         )
         down = _dip_deg(vector)
         expected = _dip_deg(readings.field_ned)

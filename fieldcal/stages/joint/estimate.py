@@ -24,6 +24,7 @@ from fieldcal.names import SENSORS, Approach, Json, Method, Rung, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Tables, is_sound, mean_temperature, reference_reading, refusal
+from fieldcal.stages.joint.beside import beside_rows
 from fieldcal.stages.joint.by_vps import (
     ByVps,
     Poses,
@@ -117,8 +118,8 @@ def _with_vps(found: ByVps, readings: Readings, tables: Tables, s: JointSettings
         "rung": Rung.BY_VPS,
         "terms": model_selection.summary(tests, fit),
     }
-    missing = {str(name): str(v) for name, v in found.triads.items() if isinstance(v, FieldcalError)}
-    result = _written(triads, fit, found.close, tables, s, measured, missing)
+    ned = multiply(found.world, found.close.path.q)
+    result = _written(triads, fit, ned, tables, s, measured, found.triads)
     return replace(result, tables={**result.tables, **_held_out(fit, readings, tables, s, poses)})
 
 
@@ -172,8 +173,12 @@ def _with_vectors(readings: Readings, tables: Tables, s: JointSettings, by_vps: 
         "rungs_without_a_minimum": dict(outcome.failed),
         "terms": model_selection.summary(tests, fit),
     }
-    result = _written(triads, fit, fit, tables, s, measured, {})
-    return replace(result, tables={**result.tables, **_held_out(fit, readings, tables, s, None)})
+    result = _written(triads, fit, fit.path.q, tables, s, measured, {})
+    told: dict[str, pl.DataFrame] = {}
+    if (code := by_vps.get("use_vps_reason")) == ReasonCode.CLOCK_RATES_DIFFER:
+        fault = Fault(Sensor.GYROSCOPE, "", ReasonCode(code), 0.0, 0.0, True, str(by_vps["use_vps_sentence"]))
+        told["faults"] = fault_rows([fault])
+    return replace(result, tables={**result.tables, **told, **_held_out(fit, readings, tables, s, None)})
 
 
 def chosen(s: JointSettings) -> tuple[Sensor, ...]:
@@ -268,6 +273,7 @@ def readings_of(tables: Tables, s: JointSettings) -> Readings:
         t=t,
         segment=segment,
         gyroscope=logged["gyroscope"],
+        force=_force(tables, s, given["accelerometer"]),
         gravity_mps2=sensor_model.GRAVITY_SIGNS[s.gravity_sign] * s.gravity_mps2,
         field_ned=np.asarray(s.field_ned, dtype=float),
         turning=initialise.turning(t, segment, logged["gyroscope"]),
@@ -293,6 +299,20 @@ def _warmth(tables: Tables, t: Array) -> Array | None:
     at = seconds(table["t_ns"], tables["samples"]["t_ns"][0])
     warm = np.interp(t, at, table["temperature_degc"].to_numpy())
     return np.asarray(warm - warm.mean())
+
+
+def _force(tables: Tables, s: JointSettings, logged: Array | None) -> Array | None:
+    """Specific force at the samples less its mean, m/s² (n, 3), sensor axes, by the serial chain's accelerometer or the
+    logged unit; None where there is neither, or not at every sample."""
+    name = Sensor.ACCELEROMETER
+    if logged is None or not np.isfinite(logged).all():
+        return None
+    found = constants(tables[name], name, None) if name in tables else None
+    found = found or logged_constants(s, name)
+    if found is None:
+        return None
+    force = sensor_model.calibrate(logged, *found)
+    return np.asarray(force - force.mean(axis=0))
 
 
 def start_constants(tables: Tables, s: JointSettings, readings: Readings) -> dict[str, tuple[Array, Array] | None]:
@@ -338,14 +358,14 @@ def _of_fit(fit: JointFit, sensor: Sensor, s: JointSettings) -> Found:
 def _written(
     triads: Mapping[Sensor, Found],
     fit: JointFit,
-    path: JointFit,
+    attitude: Array,
     tables: Tables,
     s: JointSettings,
     measured: Mapping[str, Json],
-    missing: Mapping[str, str],
+    by_pose: Mapping[Sensor, TriadByPose | FieldcalError],
 ) -> StageResult:
-    """Rows with a status by sensor and axis, the attitude, the covariance, and the numbers that decided. `path`
-    has the attitudes; `missing`: sensor → why it has no constants at all."""
+    """Rows with a status by sensor and axis, the attitude, the covariance, and the numbers that decided. `attitude`
+    (n, 4) of the sensor axes, NED; `by_pose`: what a VPS's trajectory gives of each vector triad, or why nothing."""
     rows: list[CalibrationRow] = []
     for sensor, found in triads.items():
         rows += triad_rows(
@@ -364,6 +384,13 @@ def _written(
         )
     if Sensor.GYROSCOPE in triads:
         rows += _slope_rows(fit, tables, s, triads[Sensor.GYROSCOPE].zero_codes)
+    rows += beside_rows(
+        fit,
+        by_pose,
+        _axes(s),
+        gyroscope_unit=s.units[Sensor.GYROSCOPE],
+        temperature_degc=mean_temperature(tables),
+    )
     codes = [(f"{name} {axis}", c) for name, v in triads.items() for axis, c in zip(AXES, v.codes, strict=True) if c]
     every = all(code for found in triads.values() for code in (*found.codes, *found.zero_codes))
     first = next((code for _, code in codes), None)
@@ -371,7 +398,7 @@ def _written(
     if codes:
         parts.append(f"Refused by the joint estimate ({', '.join(f'{axis}: {code}' for axis, code in codes)}).")
         parts.append(str(measured["advice"]))
-    parts += [f"{name.capitalize()}: {sentence}" for name, sentence in missing.items()]
+    parts += [f"{name.capitalize()}: {v}" for name, v in by_pose.items() if isinstance(v, FieldcalError)]
     reason = " ".join(part for part in parts if part) or None
     if not triads:
         first, reason = (
@@ -380,7 +407,7 @@ def _written(
         )
     result = {"calibration": calibration_rows(rows), "covariance": covariance_table(fit.covariance)}
     if fit.vps is not None or not any(_of_fit(fit, Sensor.GYROSCOPE, s).codes):
-        result["trajectory"] = _trajectory(path, tables, _axes(s))
+        result["trajectory"] = _trajectory(attitude, tables, _axes(s))
     return StageResult(result, Status.REFUSED if every else Status.OK, first, reason, measured)
 
 
@@ -404,10 +431,10 @@ def _slope_rows(
     )
 
 
-def _trajectory(fit: JointFit, tables: Tables, axes: Array) -> pl.DataFrame:
+def _trajectory(attitude: Array, tables: Tables, axes: Array) -> pl.DataFrame:
     """Attitude of the body at every sample."""
     samples = tables["samples"]
-    q = multiply(fit.path.q, from_matrix(axes))
+    q = multiply(attitude, from_matrix(axes))
     return samples.select("t_ns", "segment").with_columns(
         **{name: pl.Series(values) for name, values in columns_of(q, QUATERNION).items()}
     )

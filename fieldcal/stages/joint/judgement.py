@@ -21,6 +21,10 @@ HELD_SD, LARGEST_PRIOR_DISTANCE_SD = 1e-4, 4.0
 # Refusals that concern the scale alone, and the share of a prior sd that a recording has to leave to have told a zero.
 SCALE_ALONE = (ReasonCode.SCALE_UNCERTAIN, ReasonCode.AXIS_NOT_TURNED, ReasonCode.HELD_AT_NOMINAL)
 INFORMED_SHARE = 0.5
+# Of the field's dip from the configured one, °: more is another place, or an accelerometer or world upside down.
+MAX_DIP_DIFFERENCE_DEG = 20.0
+# Of the magnetometer's readings: where more are those of a passing field, none says which field is the local one.
+MAX_PASSING_SHARE = 0.4
 # √3 times the rms of |calibrated specific force| − g, over g, and the mean robust weight: numbers that no weight and no
 # fitted noise level touches. Hand-held recordings with right scales had 0.08–0.10, those 5–11 % off 0.13 and more.
 MAX_TRANSLATION_SHARE, LEAST_MEAN_WEIGHT = 0.12, 0.6
@@ -51,10 +55,15 @@ def judged(
     """Why an axis is refused, or None: scale (3,), covariance (6, 6) of scale and bias, `polarity` (3,) of ±1,
     `nominal_scale` (3,) where it is known; limits are relative."""
     if name == Sensor.GYROSCOPE:
-        if gyro_noise_share(fit) > MAX_GYRO_NOISE_SHARE:
+        unsupported = fit.vps is None and all(misfit(fit, vector) > max_residual for vector in fit.model.vectors)
+        if gyro_noise_share(fit) > MAX_GYRO_NOISE_SHARE or unsupported:
             return [ReasonCode.GYRO_CONTRADICTS_ATTITUDE] * 3
     elif misfit(fit, name) > max_residual:
         return [ReasonCode.NOT_A_SPHERE] * 3
+    if (wrong := dip_contradicts(fit)) is not None:
+        return [wrong] * 3
+    if name == Sensor.MAGNETOMETER and passing_field_share(fit) > MAX_PASSING_SHARE:
+        return [ReasonCode.VECTORS_CONTRADICT] * 3
     prior = fit.priors.get(name)
     if prior is not None:
         known = np.sqrt(np.diagonal(prior.covariance)[:3])
@@ -72,6 +81,19 @@ def judged(
         ReasonCode.AXIS_NOT_TURNED if noisy[i] and code != ReasonCode.SCALE_UNCERTAIN else code
         for i, code in enumerate(codes)
     ]
+
+
+def dip_contradicts(fit: JointFit) -> ReasonCode | None:
+    """Why the angle between field and gravity can't be that of the configured place, or None; where it is estimated."""
+    if "dip" not in fit.layout:
+        return None
+    north, east, down = fit.model.readings.field_ned
+    found, expected = fit.state.values["dip"][0], np.arctan2(down, np.hypot(north, east))
+    off = np.degrees(np.abs(np.angle(np.exp(1j * (found - np.array([expected, -expected]))))))
+    if off[0] <= MAX_DIP_DIFFERENCE_DEG:
+        return None
+    upside_down = off[1] <= MAX_DIP_DIFFERENCE_DEG
+    return ReasonCode.GRAVITY_SIGN_CONTRADICTION if upside_down else ReasonCode.FIELD_CONTRADICTED
 
 
 def judged_scales(
