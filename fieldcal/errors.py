@@ -118,7 +118,7 @@ class Refused(FieldcalError):
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     never_turned_about_z = fieldcal.Experiment(duration_s=20.0, turned=(1.0, 1.0, 0.0))
     ...     log = fieldcal.write_flights(folder, never_turned_about_z)[0]
-    ...     calibration = fieldcal.calibrate(log)
+    ...     calibration = fieldcal.calibrate(log, method="serial")
     >>> calibration.magnetometer.scale.value
     Traceback (most recent call last):
     ...

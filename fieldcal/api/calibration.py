@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
+from fieldcal.api.estimate import Estimate
 from fieldcal.api.recording import Recording, as_recording
 from fieldcal.api.sensor import SensorCalibration, not_calibrated, sensor_calibration
 from fieldcal.api.vps_clock import Rates, VpsClock
@@ -24,6 +25,7 @@ from fieldcal.schemas.rows import FlightDocument, Refusable, SyncRow
 from fieldcal.stages.tables import matrix, seconds
 from fieldcal.stages.vps import RATE_COLUMNS
 from fieldcal.words.flights import is_consequence
+from fieldcal.words.rows import standing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -100,7 +102,7 @@ class Calibration:
     ...     log = fieldcal.write_flights(folder, fieldcal.Experiment(duration_s=20.0))[0]
     ...     calibration = fieldcal.calibrate(log)
     >>> calibration.verdict, calibration.methods("gyroscope")
-    ('ok', ('output_error', 'equation_error'))
+    ('ok', ('joint', 'output_error', 'equation_error'))
     >>> scale = calibration.magnetometer.scale
     >>> scale.value.shape, scale.unit, bool((scale.sd < 0.05 * abs(scale.value)).all())
     ((3,), 'norm/counts', True)
@@ -144,7 +146,7 @@ class Calibration:
     def sensor(self, sensor: str, method: str | None = None) -> SensorCalibration:
         """A sensor's constants by `method`, else by the most exact that was not refused.
 
-        A sensor that no method found numbers for is there too: its values raise `Refused` with the reason.
+        Those of a method that is asked for by name are not refused for another's being chosen. A sensor that no method found numbers for is there too: its values raise `Refused` with the reason.
 
         Raises
         ------
@@ -156,7 +158,9 @@ class Calibration:
         methods = self.methods(sensor)
         if method is not None and method not in methods:
             raise ValueError(f"no {method!r} for the {sensor}; there is: {', '.join(methods) or 'none'}")
-        found = [self._by(sensor, name) for name in methods if method in (None, name)]
+        if method is not None:
+            return self._by(sensor, method, by_name=True)
+        found = [self._by(sensor, name) for name in methods]
         if not found:
             return not_calibrated(sensor, *self._why_none(sensor))
         return next((own for own in found if own.ok), found[0])
@@ -200,8 +204,14 @@ class Calibration:
         flight = self.document["flight"]
         return plot_calibration([self._shown(s) for s in SENSORS], f"{flight['log_uri']}: {self.verdict}")
 
-    def _by(self, sensor: str, method: str) -> SensorCalibration:
+    def _by(self, sensor: str, method: str, *, by_name: bool = False) -> SensorCalibration:
         rows = self.rows.filter(pl.col("sensor") == sensor, pl.col("method") == method)
+        if by_name:
+            passed_over = pl.col("reason_code") == ReasonCode.OTHER_METHOD_CHOSEN
+            rows = rows.with_columns(
+                status=pl.when(passed_over).then(pl.lit("ok")).otherwise("status"),
+                reason_code=pl.when(passed_over).then(None).otherwise("reason_code"),
+            )
         refused = rows.filter(pl.col("status") != "ok")
         reason = None if refused.is_empty() else self._why(sensor, method, refused["reason_code"][0])
         return sensor_calibration(rows, sensor, method, reason)
@@ -245,7 +255,10 @@ class Calibration:
             z=z,
             length=length,
             vps=self._vps_rates() if sensor == "gyroscope" else None,
-            scales=[(name, _diagonal(scale.refused_value()), _diagonal(scale.sd), scale.ok) for name, scale in scales],
+            scales=[
+                (name, _diagonal(scale.refused_value()), _diagonal(scale.sd), _standing(scale))
+                for name, scale in scales
+            ],
             used=own.method,
             refused=own.reason,
         )
@@ -327,7 +340,7 @@ def calibrate(
     ...     log = fieldcal.write_flights(folder, fieldcal.Experiment(duration_s=20.0))[0]
     ...     calibration = fieldcal.calibrate(log, parameters={"smoothing_cutoff_hz": 5.0})
     >>> calibration.gyroscope.scale.value
-    array([-0.00021..., 0.00028..., 0.00038...])
+    array([-0.00022..., 0.00028..., 0.00038...])
     >>> calibration.gyroscope.scale.unit
     'rad/s/counts'
     """
@@ -390,6 +403,11 @@ def _refusable(run: StageRun) -> Refusable:
 
 def _sentence(told: Json) -> str | None:
     return None if told is None else str(told)
+
+
+def _standing(scale: Estimate) -> str:
+    """In two words: no code of a refusal has room in a picture."""
+    return "ok" if scale.ok else standing("refused", scale.reason_code).partition(":")[0]
 
 
 def _diagonal(x: np.ndarray) -> np.ndarray:

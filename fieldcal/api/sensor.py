@@ -45,7 +45,7 @@ class SensorCalibration:
     ...     log = fieldcal.write_flights(folder, fieldcal.Experiment(duration_s=20.0))[0]
     ...     gyroscope = fieldcal.calibrate(log).gyroscope
     >>> gyroscope.method, gyroscope.ok, gyroscope.bias.unit
-    ('output_error', True, 'rad/s')
+    ('joint', True, 'rad/s')
     >>> gyroscope.apply(gyroscope.zero.value[None]).round(6) + 0.0
     array([[0., 0., 0.]])
     """

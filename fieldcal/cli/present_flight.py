@@ -13,6 +13,7 @@ from fieldcal.schemas.rows import CalibrationRow, FitRow, FlightDocument, Unfold
 from fieldcal.stages.tables import AXES
 from fieldcal.words.flights import QUANTITIES, advised, is_consequence, sync_sentence, verdict_sentence
 from fieldcal.words.numbers import cell, number, with_sd
+from fieldcal.words.rows import BESIDE, standing
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -29,6 +30,8 @@ def print_flight(console: Console, document: FlightDocument) -> None:
             console.print(f"  {finding['sentence']}", markup=False)
     if document["calibration"]:
         console.print(parameter_table(document["calibration"]))
+        if (beside := beside_table(document["calibration"])) is not None:
+            console.print(beside)
     print_refusals(console, document["run"])
     for sentence in advised(document["run"]):
         console.print(sentence, markup=False)
@@ -51,9 +54,18 @@ def parameter_table(rows: Sequence[CalibrationRow]) -> Table:
                 continue
             name = (sensor, method) if shown != (sensor, method) else ("", "")
             shown = (sensor, method)
-            status = first["status"] if first["status"] == Status.OK else f"{first['status']}: {first['reason_code']}"
+            status = standing(first["status"], first["reason_code"])
             lines.append([*name, axis, *(_value(row) for row in own), status])
     return table(["sensor", "method", "axis", *PARAMETERS, "status"], lines)
+
+
+def beside_table(rows: Sequence[CalibrationRow]) -> Table | None:
+    """What was found beside scale and zero, a number a line."""
+    found = [row for row in rows if row["parameter"] in BESIDE]
+    if not found:
+        return None
+    lines = [[row["sensor"], BESIDE[row["parameter"]], row["axis"], _value(row)] for row in found]
+    return table(["sensor", "beside scale and zero", "axis", "value"], lines)
 
 
 def _value(row: CalibrationRow | None) -> str:

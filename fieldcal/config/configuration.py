@@ -217,7 +217,7 @@ class Configuration:
         table = _laid_over(self.document.defaults, self.document.vehicles.get(vehicle_id, VehicleTable()))
         given = {
             "imu_id": table.imu_id or vehicle_id,
-            "method": dict.fromkeys(SENSORS, Approach.AUTO) | table.method,
+            "method": dict.fromkeys(SENSORS, PROFILE_METHOD.get(table.profile, Approach.AUTO)) | table.method,
             "polarity": dict.fromkeys(SENSORS, (1, 1, 1)) | table.polarity,
             "parameters": _with_presets(table.parameters, table.profile),
         }
@@ -270,6 +270,10 @@ def _laid_over(under: AnyTable, over: AnyTable) -> AnyTable:
         else:
             changes[key] = above
     return under.model_copy(update=changes)
+
+
+# What a profile other than "full" is: the paper's chain, or what runs on board of it.
+PROFILE_METHOD: Mapping[ProfileName, Approach] = {"paper": Approach.SERIAL, "onboard": Approach.SERIAL}
 
 
 def _with_presets(parameters: Parameters, profile: ProfileName) -> Parameters:

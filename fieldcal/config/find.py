@@ -55,7 +55,10 @@ def with_parameters(vehicle: Vehicle, profile: str | None, changes: Mapping[str,
     given = parse("\n".join(lines), Path("command line")).vehicle(vehicle.vehicle_id)
     over = {name: getattr(given.parameters, name) for name in changes}
     parameters = vehicle.parameters.model_copy(update=over) if profile is None else given.parameters
-    return vehicle.model_copy(update={"profile": profile or vehicle.profile, "parameters": parameters})
+    update = {"profile": profile or vehicle.profile, "parameters": parameters}
+    if profile is not None:
+        update["method"] = given.method
+    return vehicle.model_copy(update=update)
 
 
 def _toml_value(text: str) -> str:

@@ -24,7 +24,8 @@ class SensorPlot:
     """What is shown of one triad; what there is not is None.
 
     `t` (n,) s and `z` (n, 3) calibrated by method `used`, in `unit`; `length` of the sensed vector, same unit; `vps`
-    the stamps (m,), s, and rates (m, 3), rad/s, to lay beside; `scales`: method, scale (3,), sd (3,), not refused."""
+    the stamps (m,), s, and rates (m, 3), rad/s, to lay beside; `scales`: method, scale (3,), sd (3,), and "ok" or
+    why it does not count."""
 
     sensor: str
     unit: str
@@ -32,7 +33,7 @@ class SensorPlot:
     z: Array | None
     length: float | None
     vps: Rates | None
-    scales: list[tuple[str, Array, Array, bool]]
+    scales: list[tuple[str, Array, Array, str]]
     used: str | None
     refused: str | None
 
@@ -79,7 +80,8 @@ def _scales(axis: Axes, s: SensorPlot) -> None:
     """Each method's scale over the one in use, less 1, in per cent."""
     (reference,) = (value for name, value, _, _ in s.scales if name == s.used)
     step = 0.7 / len(s.scales)
-    for number, (name, value, sd, ok) in enumerate(s.scales):
+    for number, (name, value, sd, standing) in enumerate(s.scales):
+        ok = standing == "ok"
         x = np.arange(3) + step * (number - 0.5 * (len(s.scales) - 1))
         axis.errorbar(
             x,
@@ -87,7 +89,7 @@ def _scales(axis: Axes, s: SensorPlot) -> None:
             100.0 * sd / np.abs(reference),
             fmt="o" if ok else "x",
             color=COLOURS[number] if ok else REFUSED,
-            label=plain_name(name) if ok else f"{plain_name(name)} (refused)",
+            label=plain_name(name) if ok else f"{plain_name(name)} ({standing})",
             markersize=4,
             capsize=3,
             linewidth=1.2,

@@ -19,7 +19,7 @@ from fieldcal.schemas.rows import CalibrationRow, FitRow, UnfoldedFlight, Unfold
 from fieldcal.stages.warm_up import METHOD as WARM_UP
 from fieldcal.words.flights import QUANTITIES, advised, is_consequence, sync_sentence
 from fieldcal.words.numbers import cell, number
-from fieldcal.words.rows import typed
+from fieldcal.words.rows import BESIDE, standing, typed
 
 PAPER_TIC = {
     ("attitude", "quest", "vps"): 0.0352,
@@ -118,12 +118,20 @@ def _constants(calibration: pl.DataFrame) -> list[Part]:
             parts.append(_paper_table(printed, f"{name}. {sensor.capitalize()} calibration", letter))
         else:
             parts.append(Text(f"{name}: there are no constants of the {sensor}."))
-        others = [row for row in own if row["parameter"] not in PRINTED]
+        others = [row for row in own if row["parameter"] not in (*PRINTED, *BESIDE)]
         if others:
             names = " and ".join(dict.fromkeys(row["parameter"] for row in others))
             folded = _paper_table(others, f"{sensor.capitalize()}: the same as {names}", letter)
             parts.append(Folded(f"{sensor.capitalize()}: {names}", [folded]))
     warm = [row for row in rows if row["method"] == WARM_UP]
+    found = [row for row in rows if row["parameter"] in BESIDE]
+    if found:
+        columns = (Column("sensor"), Column("what"), Column("axis"), Column("value ± sd", "n"), Column("unit"))
+        lines = [
+            [r["sensor"], BESIDE[r["parameter"]], r["axis"], scientific(r["value"], r["sd"]), unit(r["unit"])]
+            for r in found
+        ]
+        parts.append(Table("Found beside scale and zero", columns, lines))
     if warm:
         parts.append(_paper_table(warm, "Warm-up of the gyroscope at rest: its zero against temperature", "ω"))
     return parts
@@ -142,7 +150,7 @@ def _paper_table(rows: Sequence[CalibrationRow], caption: str, letter: str) -> T
         own = [by_place.get((parameter, axis, method)) for method in methods]
         known = next(r for r in own if r is not None)
         refused = [
-            f"{plain_name(r['method'])} {r['status']}: {r['reason_code']}"
+            f"{plain_name(r['method'])} {standing(r['status'], r['reason_code'])}"
             for r in own
             if r and r["status"] != Status.OK
         ]

@@ -79,13 +79,14 @@ def test_a_calibration(calibrations: list[fieldcal.Calibration]) -> None:
     for word in ("(norm)", "(m/s²)", "(rad/s)", "equation error", "VPS", "± sd (%)"):
         assert word in told
     assert "refused" not in told
+    assert "ellipsoid robust (not chosen)" in told
     radius = axes[0].lines[0].get_ydata()
     assert np.abs(np.asarray(radius, dtype=float) - 1.0).max() < 0.1
 
 
 def test_a_refused_calibration_says_so(tmp_path: Path) -> None:
     experiment = fieldcal.Experiment(seed=0, duration_s=20.0, turned=(1.0, 1.0, 0.0))
-    told = labels(fieldcal.calibrate(fieldcal.write_flights(tmp_path, experiment)[0]).plot())
+    told = labels(fieldcal.calibrate(fieldcal.write_flights(tmp_path, experiment)[0], method="serial").plot())
     assert "refused: not to be used" in told
     assert "ellipsoid robust (refused)" in told
     assert "Refused: Magnetometer:" in told
@@ -117,7 +118,7 @@ def test_the_history(warehouse: fieldcal.Warehouse) -> None:
     rows = warehouse.history(sensor="gyroscope", parameter="scale")
     axes = fieldcal.plot(rows)
     assert "x (rad/s/counts)" in labels(axes)
-    wanted = rows.filter(method="output_error", axis="x").sort("started_at")["value"].to_list()
+    wanted = rows.filter(method="joint", axis="x").sort("started_at")["value"].to_list()
     assert axes[0].containers[0].lines[0].get_ydata().tolist() == wanted
 
 

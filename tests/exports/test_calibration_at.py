@@ -56,10 +56,9 @@ def wanted(log: Path, root: Path) -> dict[str, np.ndarray]:
     signals, _ = ingest.read_flight(log, load(log.parents[2] / "fieldcal.toml").vehicle("sim-1"))
     document = fieldcal.calibrate(log).document
     rows = {(r["sensor"], r["parameter"], r["axis"], r["method"]): r["value"] for r in document["calibration"]}
-    methods = {"gyroscope": "output_error", "accelerometer": "ellipsoid_robust", "magnetometer": "ellipsoid_robust"}
     result = {}
-    for sensor, method in methods.items():
-        scale, bias = (np.array([rows[sensor, p, axis, method] for axis in "xyz"]) for p in ("scale", "bias"))
+    for sensor in ("gyroscope", "accelerometer", "magnetometer"):
+        scale, bias = (np.array([rows[sensor, p, axis, "joint"] for axis in "xyz"]) for p in ("scale", "bias"))
         table = signals["magnetometer" if sensor == "magnetometer" else "imu"]
         result[sensor] = scale * matrix(table, triad(sensor)) + bias
     return result

@@ -70,7 +70,7 @@ def expected_methods(choice: dict[str, Any], sensor: str) -> set[str]:
 
 
 def joint_for(choice: dict[str, Any], sensor: str) -> bool:
-    method = choice.get("method", "serial")
+    method = choice.get("method", "serial" if "profile" in choice else "auto")
     return (method if isinstance(method, str) else method[sensor]) in ("joint", "auto")
 
 

@@ -111,10 +111,10 @@ def test_a_sample_rate_that_is_off_is_contradicted_by_the_vps() -> None:
         frames[name] = frames[name].with_columns(t_ns=pl.Series((t[0] + (t - t[0]) * 1.02).astype(np.int64)))
     results = run_flight(frames, settings(r.experiment, method="serial", vps_min_peak=0.2))
     rows = results["choice"].tables["calibration"].filter(sensor="gyroscope", parameter="scale")
-    if results["vps_sync"].status == "ok":
-        assert set(rows.filter(method="output_error")["reason_code"]) == {"vps_contradicts"}
-    else:  # two per cent of drift: the clocks have no common lag, and that is told
-        assert results["vps_sync"].reason_code in ("not_the_same_motion", "flat_peak", "ambiguous_peak")
+    assert results["vps_sync"].reason_code == "clock_rates_differ"
+    assert "2.0" in str(results["vps_sync"].reason)
+    assert set(rows.filter(method="output_error")["reason_code"]) == {"clock_rates_differ"}
+    assert set(rows["status"]) == {"refused"}
 
 
 def test_gyroscope_constants_that_are_off_are_contradicted_by_the_vps(
