@@ -146,7 +146,8 @@ class Calibration:
     def sensor(self, sensor: str, method: str | None = None) -> SensorCalibration:
         """A sensor's constants by `method`, else by the most exact that was not refused.
 
-        Those of a method that is asked for by name are not refused for another's being chosen. A sensor that no method found numbers for is there too: its values raise `Refused` with the reason.
+        Those of a method that is asked for by name are not refused for another's being chosen. A sensor that no method
+        found numbers for is there too: its values raise `Refused` with the reason.
 
         Raises
         ------
@@ -340,7 +341,7 @@ def calibrate(
     ...     log = fieldcal.write_flights(folder, fieldcal.Experiment(duration_s=20.0))[0]
     ...     calibration = fieldcal.calibrate(log, parameters={"smoothing_cutoff_hz": 5.0})
     >>> calibration.gyroscope.scale.value
-    array([-0.00022..., 0.00028..., 0.00038...])
+    array([-0.00022..., 0.00028..., 0.00037...])
     >>> calibration.gyroscope.scale.unit
     'rad/s/counts'
     """

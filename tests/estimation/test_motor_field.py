@@ -265,7 +265,7 @@ def test_a_field_of_five_per_cent_is_told(tmp_path: Path, drive: str) -> None:
 
 @pytest.mark.parametrize("method", ["serial", "joint"])
 def test_the_sd_allows_for_a_field_that_was_told(tmp_path: Path, method: str) -> None:
-    """A slow current's field is taken for scale: by 4.7 % here, which no residual shows."""
+    """A slow current's field is taken for scale: by 4.7 % here by the ellipsoid, which no residual shows."""
     truth = Experiment(seed=21).scale["magnetometer"]
     document = fieldcal.calibrate(flown(tmp_path, 0.05, "current_a"), method=method).document
     own = [row for row in document["calibration"] if row["sensor"] == "magnetometer" and row["parameter"] == "scale"]
@@ -273,7 +273,8 @@ def test_the_sd_allows_for_a_field_that_was_told(tmp_path: Path, method: str) ->
     assert {row["status"] for row in rows} == {"ok"}
     found, sd = (np.array([row[column] for row in rows]) for column in ("value", "sd"))
     assert np.abs((found - truth) / sd).max() < 2.0
-    assert np.abs(found / truth - 1.0).max() > 0.02
+    if method == "serial":
+        assert np.abs(found / truth - 1.0).max() > 0.02
     assert np.abs(sd / truth).max() == pytest.approx(0.05, abs=0.015)
 
 

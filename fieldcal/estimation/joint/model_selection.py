@@ -72,7 +72,8 @@ def _doubted(fit: JointFit, moved: list[dict[str, Array]]) -> JointFit:
     for change in moved:
         by = np.zeros(len(covariance))
         for name, values in change.items():
-            by[fit.layout[name]] = values
+            if name in fit.layout:  # a lever arm is tested anew beside the terms
+                by[fit.layout[name]] = values
         covariance += np.outer(by, by)
     return replace(fit, covariance=covariance)
 
