@@ -29,6 +29,11 @@ TRUST_ACCELERATION, TRUST_FIELD = 0.01, 0.01
 # is further off than this, an axis or sign is wrong. Not the median: at rest every polarity gives one angle. Right
 # ones show 0.3° simulated and up to 2.5° in real recordings, wrong ones 5° (no dip, one axis) to 50°.
 MAX_DIP_SCATTER_DEG = 4.0
+# TASTE is χ²₁ where the noise explains the angle between field and gravity: median 0.45, and 0.3 to 1.3 in simulated
+# and real recordings; soft iron of 8 % or axes 1° out of square make it 9 and more.
+MAX_MEDIAN_TASTE = 9.0
+# From this dip on a mirrored one, within so much of it, tells gravity's sign.
+LEAST_DIP_DEG, SAME_DIP_DEG = 20.0, 15.0
 
 
 TRUSTED_SHARE = 0.2
@@ -128,7 +133,19 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
             " number: a wrong polarity, swapped axes, or a magnet on board.",
             measured,
         )
-    if abs(expected_dip) > 20.0 and abs(dip_deg + expected_dip) < 15.0:
+    upside_down = abs(expected_dip) > LEAST_DIP_DEG and abs(dip_deg + expected_dip) < SAME_DIP_DEG
+    taste = float(np.median(fit.taste))
+    if taste > MAX_MEDIAN_TASTE and not upside_down:
+        return _contradiction(
+            ReasonCode.VECTORS_CONTRADICT,
+            taste,
+            MAX_MEDIAN_TASTE,
+            f"The angle between magnetic field and gravity ({dip_deg:.1f}° of dip, {expected_dip:.1f}° expected) is off"
+            f" by {np.sqrt(taste):.0f} times what the readings' noise allows: soft iron, axes that are not square, a"
+            " magnet on board, or another place than the configured one. Method joint can do with it.",
+            measured,
+        )
+    if upside_down:
         return _contradiction(
             ReasonCode.GRAVITY_SIGN_CONTRADICTION,
             dip_deg,
