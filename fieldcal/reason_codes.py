@@ -159,6 +159,8 @@ class ReasonCode(StrEnum):
     """A channel shows noise only."""
     WRONG_UNIT = "wrong_unit"
     """Readings do not fit the unit that they are said to have."""
+    GRAVITY_REMOVED = "gravity_removed"
+    """The accelerometer's readings lack gravity."""
     DROPOUTS = "dropouts"
     """Samples are missing."""
     RATE_CHANGES = "rate_changes"

@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 ANGLES = ("roll", "pitch", "yaw")
 TO_RAD = {"deg": np.pi / 180.0, "rad": 1.0}
@@ -29,17 +28,3 @@ def quaternion_by_names(names: Sequence[str]) -> tuple[int, int, int, int] | Non
     if len(whole) != 1:
         return None
     return whole[0]["x"][0], whole[0]["y"][0], whole[0]["z"][0], whole[0]["w"][0]
-
-
-def quaternion_of_angles(
-    roll_rad: NDArray[np.float64], pitch_rad: NDArray[np.float64], yaw_rad: NDArray[np.float64]
-) -> dict[str, NDArray[np.float64]]:
-    """Quaternions qx, qy, qz, qw, body to world, of angles (n,): yaw about z, then pitch about the new y, then roll
-    about the new x."""
-    (sr, cr), (sp, cp), (sy, cy) = ((np.sin(a / 2), np.cos(a / 2)) for a in (roll_rad, pitch_rad, yaw_rad))
-    return {
-        "qx": sr * cp * cy - cr * sp * sy,
-        "qy": cr * sp * cy + sr * cp * sy,
-        "qz": cr * cp * sy - sr * sp * cy,
-        "qw": cr * cp * cy + sr * sp * sy,
-    }

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 from fieldcal.config.values import Paths
 from fieldcal.errors import UnreadableLog
-from fieldcal.logs.csv.attitude import quaternion_by_names
+from fieldcal.logs.csv.attitude import ANGLES, quaternion_by_names
 from fieldcal.logs.csv.dialect import Dialect
 from fieldcal.logs.csv.units import sensor_unit
 from fieldcal.logs.interface import LogSummary
+from fieldcal.names import SENSORS
 from fieldcal.reason_codes import ReasonCode
 
 IMU_DEFAULTS: dict[str, tuple[str, ...]] = {
@@ -27,6 +28,14 @@ VPS_DEFAULTS: dict[str, tuple[str, ...]] = {
     "quaternion_wxyz": (),
     "roll_pitch_yaw": (),
     "position": ("px", "py", "pz"),
+}
+INERTIAL = ("gyroscope", "accelerometer")
+AXES: dict[str, tuple[str, ...]] = {key: tuple(f"{key}_{axis}" for axis in "xyz") for key in SENSORS}
+POWER_COLUMNS = {"current": ("current_a",), "throttle": ("throttle",)}
+VPS_COLUMNS = {
+    "quaternion_xyzw": ("qx", "qy", "qz", "qw"),
+    "roll_pitch_yaw": ANGLES,
+    "position": ("px_m", "py_m", "pz_m"),
 }
 OPTIONAL = ("temperature", "current", "throttle", "position")
 """What a log may lack although it is configured."""
@@ -69,6 +78,22 @@ def find_columns(
         return Columns(_position(str(configured["t"]), dialect, f"csv.{table}.t", log_name), values)
     times = [name for name in TIME_DEFAULTS if name in dialect.names]
     return Columns(_position(times[0], dialect, f"csv.{table}.t", log_name) if times else None, values)
+
+
+def signal_groups(
+    imu: Columns | None, vps: Columns | None, *, apart: bool
+) -> list[tuple[str, list[tuple[str, tuple[str, ...]]]]]:
+    """Signal table → (key of the column map, output columns). `apart`: inertial sensors have rows of their own."""
+    own = imu.values if imu is not None else {}
+    reference = vps.values if vps is not None else {}
+    inertial = [(key, AXES[key]) for key in INERTIAL if key in own]
+    return [
+        *([(key, [(key, axes)]) for key, axes in inertial] if apart else [("imu", inertial)]),
+        ("magnetometer", [("magnetometer", AXES["magnetometer"])] if "magnetometer" in own else []),
+        ("temperature", [("temperature", ("temperature_degc",))] if "temperature" in own else []),
+        ("power", [(key, outs) for key, outs in POWER_COLUMNS.items() if key in own]),
+        ("vps", [(key, outs) for key, outs in VPS_COLUMNS.items() if key in reference]),
+    ]
 
 
 def attitude_columns(dialect: Dialect, columns: Columns) -> Columns:

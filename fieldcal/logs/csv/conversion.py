@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from fieldcal.config.configuration import CsvMap
 from fieldcal.errors import UnreadableLog
-from fieldcal.logs.csv.attitude import TO_RAD, quaternion_of_angles
+from fieldcal.geometry.rotation import from_euler
+from fieldcal.logs.csv.attitude import ANGLES, TO_RAD
 from fieldcal.logs.csv.columns import Columns
 from fieldcal.logs.csv.dialect import Dialect
 from fieldcal.logs.csv.units import TO_DEGC, angle_unit, prefixed_unit, temperature_unit
@@ -71,6 +72,7 @@ def radians(csv: CsvMap, dialect: Dialect, columns: Columns, log_name: str) -> f
 
 
 def with_quaternion(values: Mapping[str, NDArray[np.float64]], to_rad: float) -> dict[str, NDArray[np.float64]]:
-    """Columns of a VPS with its angles turned into a quaternion."""
-    others = {name: column for name, column in values.items() if name not in ("roll", "pitch", "yaw")}
-    return quaternion_of_angles(*(values[name] * to_rad for name in ("roll", "pitch", "yaw"))) | others
+    """Columns of a VPS with its angles, body to world (yaw, then pitch, then roll), turned into a quaternion."""
+    q: NDArray[np.float64] = from_euler(np.stack([values[name] * to_rad for name in ANGLES], axis=1))
+    turned = {name: q[:, k].copy() for k, name in enumerate(("qx", "qy", "qz", "qw"))}
+    return turned | {name: column for name, column in values.items() if name not in ANGLES}

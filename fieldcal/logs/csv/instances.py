@@ -48,3 +48,13 @@ def several_units(name: str, column: str, values: list[str]) -> UnreadableLog:
         f"{name} holds rows of several IMUs, told apart by column {column!r}: {', '.join(values)}. Choose one: set "
         f"csv.instance to {' or '.join(repr(value) for value in values)}.",
     )
+
+
+def absent_unit(name: str, column: str, cells: pl.Series, instance: str) -> UnreadableLog:
+    """The refusal of a file in which the chosen IMU is not to be found."""
+    there = sorted(cells.str.strip_chars().drop_nulls().unique().to_list())[:MOST_UNITS]
+    return UnreadableLog(
+        ReasonCode.SEVERAL_UNITS,
+        f"No row of {name} says {instance!r} in column {column!r}, which csv.instance asks for; there are "
+        f"{', '.join(there) or 'none'}. Correct csv.instance.",
+    )

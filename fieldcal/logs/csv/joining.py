@@ -17,10 +17,10 @@ SHARED = 0.5
 
 
 def stand_apart(gyroscope: NDArray[np.bool_], accelerometer: NDArray[np.bool_]) -> bool:
-    """Whether sensors have rows of their own, from where (n,) each has a reading."""
-    alone = min(int((gyroscope & ~accelerometer).sum()), int((accelerometer & ~gyroscope).sum()))
-    either = int((gyroscope | accelerometer).sum())
-    return alone >= LEAST_ROWS and int((gyroscope & accelerometer).sum()) < SHARED * either
+    """Whether sensors have rows of their own, or one of them is in few rows, from where (n,) each has a reading."""
+    both, either = int((gyroscope & accelerometer).sum()), int((gyroscope | accelerometer).sum())
+    fewer = min(int(gyroscope.sum()), int(accelerometer.sum()))
+    return fewer >= LEAST_ROWS and both < SHARED * either
 
 
 class SensorJoin:
@@ -61,7 +61,8 @@ class SensorJoin:
             len(t_ns),
             f"{name}: gyroscope and accelerometer stand in rows of their own; the accelerometer was interpolated to "
             f"{len(t_ns)} stamps of the gyroscope, between readings at most "
-            f"{LONGEST_INTERVALS * usual_ns * 1e-9:.3g} s apart. {n - len(t_ns)} gyroscope readings without two such readings about them were left out.",
+            f"{LONGEST_INTERVALS * usual_ns * 1e-9:.3g} s apart. {n - len(t_ns)} gyroscope readings without two such "
+            "readings about them were left out.",
             loses_data=in_pauses > 0,
         )
         return columns, finding

@@ -13,8 +13,8 @@ from fieldcal.config.configuration import CsvTimeUnit, Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.csv import columns as columns_of
 from fieldcal.logs.csv import conversion, instances
-from fieldcal.logs.csv.attitude import ANGLES
 from fieldcal.logs.csv.clock import FileClock
+from fieldcal.logs.csv.columns import INERTIAL
 from fieldcal.logs.csv.dialect import cells_of, find_dialect
 from fieldcal.logs.csv.joining import SensorJoin, stand_apart
 from fieldcal.logs.csv.losses import Losses
@@ -24,16 +24,8 @@ from fieldcal.logs.csv.time import looks_iso8601, looks_time_of_day, sample_time
 from fieldcal.logs.csv.units import time_unit
 from fieldcal.logs.interface import Batch, LogSummary, stamps_are_epoch
 from fieldcal.logs.interface import Columns as BatchColumns
-from fieldcal.names import SENSORS
 from fieldcal.reason_codes import ReasonCode
 
-VPS_COLUMNS = {
-    "quaternion_xyzw": ("qx", "qy", "qz", "qw"),
-    "roll_pitch_yaw": ANGLES,
-    "position": ("px_m", "py_m", "pz_m"),
-}
-AXES: dict[str, tuple[str, ...]] = {key: tuple(f"{key}_{axis}" for axis in "xyz") for key in SENSORS}
-POWER_COLUMNS = {"current": ("current_a",), "throttle": ("throttle",)}
 _LINES_LOOKED_AT = 50
 
 
@@ -154,13 +146,7 @@ class CsvTable:
         return found
 
     def _instances(self, first: bytes) -> int | None:
-        """Position of the column that tells several IMUs apart, where one of them is chosen.
-
-        Raises
-        ------
-        UnreadableLog
-            `several_units`: none is chosen, or none such is there; `missing_column`.
-        """
+        """Position of the column that tells several IMUs apart, where one of them is chosen; refused where none is."""
         if self.imu is None:
             return None
         named = {"instance": self._csv.imu["instance"]} if "instance" in self._csv.imu else {}
@@ -176,15 +162,20 @@ class CsvTable:
             if values:
                 raise instances.several_units(self._name, self.dialect.names[place], values)
             return None
-        return place if found or values else None
+        if not found and not values:
+            return None
+        if not instances.rows_of(cells, self._csv.instance).any():
+            raise instances.absent_unit(self._name, self.dialect.names[place], cells, self._csv.instance)
+        return place
 
     def _sensors_stand_apart(self, first: bytes) -> bool:
-        if self.imu is None or not {"gyroscope", "accelerometer"} <= self.imu.values.keys():
+        if self.imu is None or not set(INERTIAL) <= self.imu.values.keys():
             return False
         frame = self._first_rows(first, self._wanted())
-        places = [self.imu.values[key] for key in ("gyroscope", "accelerometer")]
+        places = [self.imu.values[key] for key in INERTIAL]
         readings = np.stack([[numbers_of(frame[str(place)])[0] for place in axes] for axes in places])
-        return stand_apart(*np.isfinite(readings).all(axis=1))
+        whole = np.isfinite(readings)
+        return stand_apart(whole[0].all(axis=0), whole[1].all(axis=0))
 
     def _first_rows(self, first: bytes, columns: list[int]) -> pl.DataFrame:
         skip = self.dialect.first_row
@@ -234,7 +225,7 @@ class CsvTable:
         chosen = np.ones(len(numbers), bool)
         if self._instance_place is not None and self._csv.instance is not None:
             chosen = instances.rows_of(frame[str(self._instance_place)], self._csv.instance)
-        for table, groups in self._tables():
+        for table, groups in columns_of.signal_groups(self.imu, self.vps, apart=self._join is not None):
             columns = self.imu if table != "vps" else self.vps
             if columns is None or not groups:
                 continue
@@ -265,7 +256,7 @@ class CsvTable:
                 continue
             batch = self._batch(t_ns[kept], {out: column[kept] for out, column in values.items()})
             self._summary.epoch_known |= columns.time is not None and stamps_are_epoch(t_ns[kept])
-            if self._join is not None and table in SENSORS:
+            if self._join is not None and table in INERTIAL:
                 self._join.add(table, t_ns[kept], np.column_stack([batch[out] for out in required]))
                 continue
             self._summary.count_rows(table, batch)
@@ -274,7 +265,7 @@ class CsvTable:
     def _batch(self, t_ns: NDArray[np.int64], values: dict[str, NDArray[np.float64]]) -> BatchColumns:
         """Rows of one table in the units that are delivered."""
         for sensor, factor in self._factors.items():
-            values |= {out: values[out] * factor for out in AXES[sensor] if out in values}
+            values |= {out: values[out] * factor for out in columns_of.AXES[sensor] if out in values}
         if "temperature_degc" in values and self._to_degc != (1.0, 0.0):
             values["temperature_degc"] = values["temperature_degc"] * self._to_degc[0] + self._to_degc[1]
         if "roll" in values:
@@ -293,21 +284,6 @@ class CsvTable:
     def _numeric(self) -> list[str]:
         tables = [table for table in (self.imu, self.vps) if table is not None]
         return sorted({str(place) for table in tables for places in table.values.values() for place in places})
-
-    def _tables(self) -> list[tuple[str, list[tuple[str, tuple[str, ...]]]]]:
-        """Signal table -> (key of the column map, output columns)."""
-        imu = self.imu.values if self.imu is not None else {}
-        vps = self.vps.values if self.vps is not None else {}
-        inertial = [(key, AXES[key]) for key in ("gyroscope", "accelerometer") if key in imu]
-        magnetic = [("magnetometer", AXES["magnetometer"])] if "magnetometer" in imu else []
-        apart = [(key, [(key, axes)]) for key, axes in inertial] if self._join is not None else [("imu", inertial)]
-        return [
-            *apart,
-            ("magnetometer", magnetic),
-            ("temperature", [("temperature", ("temperature_degc",))] if "temperature" in imu else []),
-            ("power", [(key, outs) for key, outs in POWER_COLUMNS.items() if key in imu]),
-            ("vps", [(key, outs) for key, outs in VPS_COLUMNS.items() if key in vps]),
-        ]
 
     def _report(self, losses: Losses) -> None:
         bad_times = [clock.bad_cell for clock in self._clocks.values() if clock.bad_cell is not None]
