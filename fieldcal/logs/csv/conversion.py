@@ -73,6 +73,6 @@ def radians(csv: CsvMap, dialect: Dialect, columns: Columns, log_name: str) -> f
 
 def with_quaternion(values: Mapping[str, NDArray[np.float64]], to_rad: float) -> dict[str, NDArray[np.float64]]:
     """Columns of a VPS with its angles, body to world (yaw, then pitch, then roll), turned into a quaternion."""
-    q: NDArray[np.float64] = from_euler(np.stack([values[name] * to_rad for name in ANGLES], axis=1))
+    q = np.asarray(from_euler(np.stack([values[name] * to_rad for name in ANGLES], axis=1)), dtype=np.float64)
     turned = {name: q[:, k].copy() for k, name in enumerate(("qx", "qy", "qz", "qw"))}
     return turned | {name: column for name, column in values.items() if name not in ANGLES}
