@@ -103,7 +103,7 @@ def _headers(table: Table) -> Iterator[Written]:
     yield Written("a header in a comment", joined(["# " + lines[0], *lines[1:]]), OK, EVERY)
     yield Written("comments before the header", joined(["# made by hand", "#", *lines]), OK, EVERY)
     yield Written("empty lines before the header", b"\n\r\n\n" + joined(lines), OK, EVERY)
-    yield Written("a line of prose before the header", joined(["Recorded on Tuesday", *lines]), NOTHING)
+    yield Written("a line of prose before the header", joined(["Recorded on Tuesday", *lines]), OK, EVERY)
     yield Written("a units row", joined([lines[0], "s,rad/s,rad/s,rad/s,m/s^2,m/s^2,m/s^2", *lines[1:]]), OK, EVERY)
     yield Written("a units row of other units", joined([lines[0], "s,mdps,mdps,mdps,mg,mg,mg", *lines[1:]]), OK, EVERY)
     yield Written(
