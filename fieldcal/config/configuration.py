@@ -137,6 +137,7 @@ class McapMap(Table):
     imu_fields: Annotated[ImuFields | None, _meaning("fields of the IMU's message: one vector, or three numbers")] = (
         None
     )
+    frame_id: Annotated[Text | None, _meaning("which of several IMUs on one topic: its messages' frame_id")] = None
     time: Annotated[Literal["header", "log"], _meaning("the stamp used: the message's own, or the recorder's")] = (
         "header"
     )

@@ -12,6 +12,7 @@ from fieldcal.logs.csv.attitude import ANGLES, quaternion_by_names
 from fieldcal.logs.csv.dialect import Dialect
 from fieldcal.logs.csv.units import sensor_unit
 from fieldcal.logs.interface import LogSummary
+from fieldcal.logs.joining import INERTIAL
 from fieldcal.names import SENSORS
 from fieldcal.reason_codes import ReasonCode
 
@@ -29,7 +30,6 @@ VPS_DEFAULTS: dict[str, tuple[str, ...]] = {
     "roll_pitch_yaw": (),
     "position": ("px", "py", "pz"),
 }
-INERTIAL = ("gyroscope", "accelerometer")
 AXES: dict[str, tuple[str, ...]] = {key: tuple(f"{key}_{axis}" for axis in "xyz") for key in SENSORS}
 POWER_COLUMNS = {"current": ("current_a",), "throttle": ("throttle",)}
 VPS_COLUMNS = {

@@ -14,9 +14,7 @@ from fieldcal.errors import UnreadableLog
 from fieldcal.logs.csv import columns as columns_of
 from fieldcal.logs.csv import conversion, instances
 from fieldcal.logs.csv.clock import FileClock
-from fieldcal.logs.csv.columns import INERTIAL
 from fieldcal.logs.csv.dialect import cells_of, find_dialect
-from fieldcal.logs.csv.joining import SensorJoin, stand_apart
 from fieldcal.logs.csv.losses import Losses
 from fieldcal.logs.csv.rows import numbers_of, other_header, read_rows
 from fieldcal.logs.csv.text import LineBlocks
@@ -24,6 +22,7 @@ from fieldcal.logs.csv.time import looks_iso8601, looks_time_of_day, sample_time
 from fieldcal.logs.csv.units import time_unit
 from fieldcal.logs.interface import Batch, LogSummary, stamps_are_epoch
 from fieldcal.logs.interface import Columns as BatchColumns
+from fieldcal.logs.joining import INERTIAL, SensorJoin, stand_apart
 from fieldcal.reason_codes import ReasonCode
 
 _LINES_LOOKED_AT = 50

@@ -1,4 +1,4 @@
-"""Gyroscope and accelerometer in rows of their own: joined on the gyroscope's stamps by interpolation."""
+"""Gyroscope and accelerometer in rows or messages of their own: joined on the gyroscope's stamps by interpolation."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from fieldcal.geometry.intervals import interval_of
 from fieldcal.logs.interface import Columns, Finding
 from fieldcal.reason_codes import ReasonCode
 
+INERTIAL = ("gyroscope", "accelerometer")
 LONGEST_INTERVALS = 4
 """Readings further apart than so many usual intervals are not interpolated between."""
 LEAST_ROWS = 10
@@ -34,12 +35,12 @@ class SensorJoin:
         self._gathered.setdefault(sensor, []).append((t_ns, readings))
 
     def joined(self, name: str) -> tuple[Columns, Finding] | None:
-        """The gyroscope's rows, in the file's order, between accelerometer readings, and what was done in the file
+        """The gyroscope's rows, in the log's order, between accelerometer readings, and what was done in the log
         called `name`; None where one of the sensors has fewer than two readings."""
         if len(self._gathered) < 2:
             return None
-        t_ns, rates = self._whole("gyroscope")
-        at_ns, forces = self._whole("accelerometer")
+        t_ns, rates = self._whole(INERTIAL[0])
+        at_ns, forces = self._whole(INERTIAL[1])
         at_ns, places = np.unique(at_ns, return_index=True)
         forces = forces[places]
         if len(at_ns) < 2:
@@ -54,12 +55,12 @@ class SensorJoin:
         share = ((t_ns - at_ns[i]) / (at_ns[i + 1] - at_ns[i]))[:, None]
         between = (1.0 - share) * forces[i] + share * forces[i + 1]
         columns: Columns = {"t_ns": t_ns}
-        for sensor, readings in (("gyroscope", rates), ("accelerometer", between)):
+        for sensor, readings in zip(INERTIAL, (rates, between), strict=True):
             columns |= {f"{sensor}_{axis}": readings[:, k].copy() for k, axis in enumerate("xyz")}
         finding = Finding(
             ReasonCode.SENSORS_JOINED,
             len(t_ns),
-            f"{name}: gyroscope and accelerometer stand in rows of their own; the accelerometer was interpolated to "
+            f"{name}: gyroscope and accelerometer stand apart from each other; the accelerometer was interpolated to "
             f"{len(t_ns)} stamps of the gyroscope, between readings at most "
             f"{LONGEST_INTERVALS * usual_ns * 1e-9:.3g} s apart. {n - len(t_ns)} gyroscope readings without two such "
             "readings about them were left out.",
