@@ -212,6 +212,13 @@ def test_a_vps_whose_clock_begins_again_at_another_moment(tmp_path: Path) -> Non
     assert codes(summary) == ["clock_wrapped"]
 
 
+@pytest.mark.parametrize(("pause_s", "wraps"), [(599, True), (601, False)])
+def test_a_pause_over_midnight(tmp_path: Path, pause_s: int, wraps: bool) -> None:
+    true_s = np.r_[86_390:86_398, 86_397 + pause_s + np.arange(20)]
+    frames, _ = read(tmp_path, lines([str(t % 86_400) for t in true_s.tolist()], readings(28)))
+    assert (frames["imu"]["t_ns"].to_list() == (true_s * S).tolist()) == wraps
+
+
 def test_late_rows_about_the_turn_stay_beside_their_neighbours(tmp_path: Path) -> None:
     true_ms = 2**24 + 5 * np.arange(-200, 200)
     true_ms[[199, 200]] = true_ms[[200, 199]]
@@ -220,6 +227,15 @@ def test_late_rows_about_the_turn_stay_beside_their_neighbours(tmp_path: Path) -
     )
     assert frames["imu"]["t_ns"].to_list() == np.sort(true_ms * 1_000_000).tolist()
     assert codes(summary) == ["clock_wrapped"]
+
+
+@pytest.mark.parametrize("late", [17, 20, 24, 25])
+def test_a_late_row_near_the_start_is_no_turn_of_a_small_counter(tmp_path: Path, late: int) -> None:
+    """The first row comes behind one of nearly 256 ms."""
+    t_ms = 10 * np.r_[1:late, 0, late:60]
+    frames, summary = read(tmp_path, lines([str(t) for t in t_ms.tolist()], readings(60), NAMES.replace("t_s", "t_ms")))
+    assert frames["imu"]["t_ns"].to_list() == [10_000_000 * i for i in range(60)]
+    assert codes(summary) == []
 
 
 def test_a_counter_of_an_unknown_period_is_refused_with_it_until_it_is_given(tmp_path: Path) -> None:

@@ -17,10 +17,14 @@ DAY_NS = 86_400 * 1_000_000_000
 WEEK_NS = 7 * DAY_NS
 WRAP_PAUSE_NS = 10_000_000_000
 """Longest pause over which a clock may have begun again."""
+CALENDAR_PAUSE_NS = 600_000_000_000
+"""The same over midnight, or the end of the week, which a clock hardly ever meets by chance."""
 WRAP_SHARE = 1e-3
 """Longest such pause as a share of the period: a clock that was reset hardly ever looks like a counter's end."""
 WRAP_INTERVALS = 8
 """So many intervals may pass in any case."""
+ROWS_BEHIND = 8
+"""Most of so many rows behind the turn begin again with it."""
 RESTART_NS = 1_000_000_000
 """Steps back that are longer are a clock that began again, shorter ones rows that came late."""
 
@@ -114,9 +118,16 @@ class FileClock:
         interval = float(np.median(growing)) if growing.size else 0.0
         for period in self._known:
             pause = min(max(WRAP_SHARE * period, WRAP_INTERVALS * interval), self._pause)
+            if self._unit and period in (DAY_NS, WEEK_NS):
+                pause = CALENDAR_PAUSE_NS
             slack = period / 2 if self._declared else pause
             inside = (previous < period) & (t >= 0) & (step < -period // 2)
-            if (inside & (step + period <= slack)).any():
+            turns = np.flatnonzero(inside & (step + period <= slack))
+            if not turns.size:
+                continue
+            # A row that came late is alone: what follows it goes on where the row before it stood.
+            low = t[turns[0] : turns[0] + ROWS_BEHIND] < previous[turns[0]] - period // 2
+            if low.mean() > 0.5:
                 return period
         restart = np.flatnonzero((step < -self._restart) & (t >= 0) & (t <= WRAP_INTERVALS * interval))
         if restart.size:

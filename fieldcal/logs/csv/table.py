@@ -25,7 +25,7 @@ from fieldcal.logs.interface import Columns as BatchColumns
 from fieldcal.logs.joining import INERTIAL, SensorJoin, stand_apart
 from fieldcal.reason_codes import ReasonCode
 
-_LINES_LOOKED_AT = 50
+_LINES_LOOKED_AT, _ROWS_LOOKED_AT = 50, 5000
 
 
 class CsvTable:
@@ -178,12 +178,10 @@ class CsvTable:
 
     def _first_rows(self, first: bytes, columns: list[int]) -> pl.DataFrame:
         skip = self.dialect.first_row
-        body = first.split(b"\n", skip)[skip] if first.count(b"\n") >= skip else b""
-        return (
-            read_rows(body, self.dialect, 1, columns, Losses())[0]
-            if body
-            else pl.DataFrame(schema={str(column): pl.String for column in columns})
-        )
+        lines = first.split(b"\n", skip + _ROWS_LOOKED_AT)[skip:-1]
+        if not lines:
+            return pl.DataFrame(schema={str(column): pl.String for column in columns})
+        return read_rows(b"\n".join(lines) + b"\n", self.dialect, 1, columns, Losses())[0]
 
     def _cells_of_first_row(self, block: bytes) -> list[str]:
         for line in block.split(b"\n", self.dialect.first_row + _LINES_LOOKED_AT)[self.dialect.first_row : -1]:
