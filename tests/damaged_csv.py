@@ -103,9 +103,11 @@ def _headers(table: Table) -> Iterator[Written]:
     yield Written("a header in a comment", joined(["# " + lines[0], *lines[1:]]), OK, EVERY)
     yield Written("comments before the header", joined(["# made by hand", "#", *lines]), OK, EVERY)
     yield Written("empty lines before the header", b"\n\r\n\n" + joined(lines), OK, EVERY)
-    yield Written("a line of prose before the header", joined(["Recorded on Tuesday", *lines]), NOTHING)
+    yield Written("a line of prose before the header", joined(["Recorded on Tuesday", *lines]), OK, EVERY)
     yield Written("a units row", joined([lines[0], "s,rad/s,rad/s,rad/s,m/s^2,m/s^2,m/s^2", *lines[1:]]), OK, EVERY)
-    yield Written("a units row of other units", joined([lines[0], "s,mdps,mdps,mdps,mg,mg,mg", *lines[1:]]), OK, EVERY)
+    yield Written(
+        "a units row of other units", joined([lines[0], "s,mdps,mdps,mdps,mg,mg,mg", *lines[1:]]), says="converted"
+    )
     yield Written(
         "a column's name twice", joined([lines[0].replace("gy", "gx"), *lines[1:]]), NOTHING, says="2 columns"
     )
@@ -219,7 +221,7 @@ def _floods(table: Table) -> Iterator[Written]:
         joined([lines[0] + "," + wide, *(line + ",1" * 150_000 for line in lines[1:6])]),
         (*OK, *NOTHING),
     )
-    yield Written("a quoted header of 900 KB", b'"' + b"x" * 900_000 + b'"\n' + joined(lines), NOTHING)
+    yield Written("a quoted title of 900 KB", b'"' + b"x" * 900_000 + b'"\n' + joined(lines), OK, EVERY)
     yield Written("an open quote of 900 KB", joined(lines[:90]) + b'"' + b"x" * 900_000 + b"\n", LOSSY)
     row = b"0,1,2,3,4,5,6\n"
     yield Written("9 MB of the same row", lines[0].encode() + b"\n" + row * (9_000_000 // len(row)), NOTHING)

@@ -41,6 +41,8 @@ from fieldcal.names import SENSORS, Approach, Body, FieldUnit, GravitySign, Json
 from fieldcal.reason_codes import ReasonCode
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+CsvTimeUnit = Literal["s", "ms", "us", "ns", "iso8601", "time_of_day"]
+VPS_ATTITUDES = ("quaternion_xyzw", "quaternion_wxyz", "roll_pitch_yaw")
 FIELD_UNITS = ("norm", "T", "uT", "G")
 AnyTable = TypeVar("AnyTable", bound=Table)
 
@@ -83,12 +85,44 @@ class LocalField(Table):
 class CsvMap(Table):
     """Where a vehicle's CSV logs differ from the default columns. `imu` and `vps` hold configured names only."""
 
-    time_unit: Annotated[Literal["s", "ms", "us", "ns", "iso8601"] | None, _meaning("unit of the time column")] = None
+    time_unit: Annotated[CsvTimeUnit | None, _meaning("unit of the time column of the IMU's file")] = None
+    vps_time_unit: Annotated[CsvTimeUnit | None, _meaning("unit of the VPS's time column, where it does not say")] = (
+        None
+    )
     rate_hz: Annotated[Positive | None, _meaning("rate of the rows, where no column tells time", "Hz")] = None
+    clock_period_s: Annotated[
+        Positive | None, _meaning("time after which the clock begins again at zero, where no known counter's", "s")
+    ] = None
     imu: Annotated[ImuColumns, _meaning("names of the columns of the IMU; three for a sensor")] = {}
     vps: Annotated[VpsColumns, _meaning("names of the columns of the visual positioning system")] = {}
+    vps_angle_unit: Annotated[Literal["deg", "rad"] | None, _meaning("unit of csv.vps.roll_pitch_yaw")] = None
+    instance: Annotated[
+        Text | None, _meaning("which of several IMUs in one file: what their column csv.imu.instance says")
+    ] = None
     separator: Annotated[Character | None, _meaning("what separates the cells")] = None
     decimal: Annotated[Literal[".", ","] | None, _meaning("the decimal point")] = None
+
+    @classmethod
+    def check_whole(cls, raw: Mapping[str, object]) -> None:
+        """No two keys contradict each other, no column is two things."""
+        separator = raw.get("separator")
+        if isinstance(separator, str) and (separator.isalnum() or separator in '+-."#'):
+            wrong(ReasonCode.WRONG_VALUE, f"{shown(separator)} stands in numbers or words", "separator")
+        attitudes = [key for key in VPS_ATTITUDES if key in _keys(raw.get("vps"))]
+        if len(attitudes) > 1:
+            wrong(ReasonCode.WRONG_VALUE, f"give one attitude, not both {attitudes[0]} and {attitudes[1]}", "vps")
+        if "vps_angle_unit" in raw and "roll_pitch_yaw" not in attitudes:
+            wrong(ReasonCode.WRONG_VALUE, "it needs csv.vps.roll_pitch_yaw, the angles", "vps_angle_unit")
+        for table in ("imu", "vps"):
+            taken: dict[object, str] = {}
+            for key, named in _keys(raw.get(table)).items():
+                for name in named if isinstance(named, list | tuple) else [named]:
+                    if isinstance(name, str) and taken.setdefault(name, key) != key:
+                        wrong(ReasonCode.WRONG_VALUE, f"{shown(name)} cannot be {taken[name]} and {key}", table)
+
+
+def _keys(table: object) -> Mapping[str, object]:
+    return table if isinstance(table, Mapping) else {}
 
 
 class McapMap(Table):
@@ -103,6 +137,7 @@ class McapMap(Table):
     imu_fields: Annotated[ImuFields | None, _meaning("fields of the IMU's message: one vector, or three numbers")] = (
         None
     )
+    frame_id: Annotated[Text | None, _meaning("which of several IMUs on one topic: its messages' frame_id")] = None
     time: Annotated[Literal["header", "log"], _meaning("the stamp used: the message's own, or the recorder's")] = (
         "header"
     )

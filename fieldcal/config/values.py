@@ -172,8 +172,12 @@ UNITS = {
     Sensor.ACCELEROMETER: ("counts", "m/s^2", "g"),
     Sensor.GYROSCOPE: ("counts", "rad/s", "deg/s"),
 }
-_IMU_COLUMNS = {"t": 1, **{str(sensor): 3 for sensor in SENSORS}, "temperature": 1, "current": 1, "throttle": 1}
-_VPS_COLUMNS = {"t": 1, "quaternion_xyzw": 4, "position": 3}
+_IMU_COLUMNS = {
+    "t": 1,
+    **{str(sensor): 3 for sensor in SENSORS},
+    **{"temperature": 1, "current": 1, "throttle": 1, "instance": 1},
+}
+_VPS_COLUMNS = {"t": 1, "quaternion_xyzw": 4, "quaternion_wxyz": 4, "roll_pitch_yaw": 3, "position": 3}
 _IMU_FIELDS = {**{str(sensor): 3 for sensor in SENSORS}, "temperature": 1}
 _ONE_NUMBER = {"type": "number", "exclusiveMinimum": 0}
 _THREE_NUMBERS = {"type": "array", "items": _ONE_NUMBER, "minItems": 3, "maxItems": 3}

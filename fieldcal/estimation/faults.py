@@ -62,6 +62,9 @@ WHITE_RATIO = 0.8
 LARGEST_NOISE_SI = {"gyroscope": 5.0, "accelerometer": 20.0}
 """Standard deviation, rad/s and m/s², beyond which noise is no sensor's."""
 
+MPS2_UNITS = {"m/s^2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "cm/s^2": 0.01}
+"""Units that an accelerometer's readings may be in, in m/s²."""
+
 GRAVITY_RATIO = (0.5, 2.0)
 """Median length of specific force over gravity in any flight that is not a fall or a launch."""
 
@@ -223,8 +226,7 @@ def accelerometer_unit(logged: ArrayLike, unit: str, in_mps2: float, gravity_mps
     ratio = length * in_mps2 / gravity_mps2
     if GRAVITY_RATIO[0] <= ratio <= GRAVITY_RATIO[1]:
         return None
-    units = {"m/s^2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "cm/s^2": 0.01}
-    return _unit_fault("accelerometer", unit, length, ratio, GRAVITY_RATIO, units, gravity_mps2, "gravity")
+    return _unit_fault("accelerometer", unit, length, ratio, GRAVITY_RATIO, MPS2_UNITS, gravity_mps2, "gravity")
 
 
 def magnetometer_unit(logged: ArrayLike, unit: str, in_tesla: float, field_t: float | None) -> Fault | None:

@@ -116,7 +116,24 @@ class TidyLog:
 
     def _findings(self) -> list[Finding]:
         own = [finding for signal in self._signals.values() for finding in signal.findings(self._name)]
-        return [*self._reader.summary.findings, *own]
+        return [*self._reader.summary.findings, *own, *self._apart()]
+
+    def _apart(self) -> Iterator[Finding]:
+        """A magnetometer whose stamps lie all before or all after the IMU's: nothing can lay them beside each other."""
+        imu, field = self._signals.get("imu"), self._signals.get("magnetometer")
+        if imu is None or field is None:
+            return
+        ends = (imu.first_ns, imu.last_ns, field.first_ns, field.last_ns)
+        first, last, field_first, field_last = (0 if end is None else end for end in ends)
+        if None not in ends and (field_last < first or field_first > last):
+            away_s = max(first - field_last, field_first - last) * 1e-9
+            yield Finding(
+                ReasonCode.CLOCKS_APART,
+                field.rows,
+                f"{self._name}: the clocks of magnetometer and IMU do not overlap: {field.rows} readings of the "
+                f"magnetometer lie {away_s:.3f} s away from the IMU's and cannot be used. Stamp both by one clock.",
+                loses_data=True,
+            )
 
     def facts(self) -> Facts:
         """What is known of the flight, plain JSON; unknown numbers are None."""

@@ -182,7 +182,7 @@ def logged_units(
                     ReasonCode.UNIT_NOT_SUPPORTED,
                     1,
                     f"{log_name}: the log gives its {sensor} in {own!r}, which is none of "
-                    f"{', '.join(UNITS[sensor])}. Convert the log.",
+                    f"{', '.join(UNITS[sensor])}. Set units.{sensor} if it is one of them, else convert the log.",
                 )
             own = None
         if own and wanted and own != wanted:

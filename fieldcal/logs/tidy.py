@@ -23,7 +23,12 @@ CLOCK_RESET_NS = 1_000_000_000
 GAP_NS = 1_000_000_000
 MOST_REPEATED = 0.5
 PLAUSIBLE_RATE_HZ = (1.0, 50_000.0)
+"""At the lower one lie 1 kHz whose milliseconds are read as seconds."""
+USUAL_RATE_HZ = (10.0, 10_000.0)
 MOST_INTERVALS = 1 << 20
+ROUNDED_SHARE, SAME_SIZE_SHARE = 0.1, 0.95
+"""Where more rows than the first share repeat a stamp, by groups of which fewer than the second are of one size, stamps
+were rounded: two sensors in one table make groups of one size."""
 
 
 class Disordered(Exception):
@@ -45,6 +50,7 @@ class TidySignal:
         self.table = table
         self.rows = self.not_finite = self.duplicates = self.conflicts = self.disordered = 0
         self.wild = self.masked = self.far = self.back_ns = self.gaps = self.longest_gap_ns = 0
+        self.rounded = False
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self._unwrap = stamps.Unwrapper()
@@ -149,12 +155,26 @@ class TidySignal:
         return first, copy
 
     def _one_a_stamp(self, frame: pl.DataFrame) -> pl.DataFrame:
-        """Of the sorted rows the first of every stamp; the others are counted as copies or contradictions."""
+        """Of the sorted rows one of every stamp; the others are counted as copies or contradictions.
+
+        It is the first, but where stamps were rounded: the first of many was read before its stamp, so that all would
+        be delayed. There the middle one is kept; of two in the middle, by turns the older and the younger.
+        """
         first, copy = self._copies(frame)
         if not first.all():
+            conflicts = int(np.count_nonzero(~first & ~copy))
             self.duplicates += int(np.count_nonzero(copy))
-            self.conflicts += int(np.count_nonzero(~first & ~copy))
-            frame = frame.filter(pl.Series(first))
+            self.conflicts += conflicts
+            kept = first
+            starts = np.flatnonzero(first)
+            sizes = np.diff(np.r_[starts, len(frame)])
+            same = np.bincount(sizes).max() / len(sizes)
+            if conflicts > ROUNDED_SHARE * len(frame) and same < SAME_SIZE_SHARE and not copy.any():
+                kept = np.zeros(len(frame), dtype=bool)
+                even = sizes % 2 == 0
+                kept[starts + (sizes - 1) // 2 + (even & (np.cumsum(even) % 2 == 0))] = True
+                self.rounded = True
+            frame = frame.filter(pl.Series(kept))
         self._account(frame["t_ns"].to_numpy())
         return frame
 
@@ -192,8 +212,9 @@ class TidySignal:
             yield Finding(
                 ReasonCode.REPEATED_STAMPS,
                 self.conflicts,
-                f"{name}: {self.conflicts} rows of {table} repeat a time stamp with other values; the first of each "
-                "stamp was kept.",
+                f"{name}: {self.conflicts} rows of {table} repeat a time stamp with other values; "
+                + ("the stamps were rounded: the middle one" if self.rounded else "the first")
+                + " of each stamp was kept.",
                 loses_data=sensors,
             )
         if self.duplicates:
@@ -244,12 +265,12 @@ class TidySignal:
                 loses_data=sensors,
             )
         rate = self.rate_hz()
-        if table == "imu" and rate is not None and not PLAUSIBLE_RATE_HZ[0] <= rate <= PLAUSIBLE_RATE_HZ[1]:
+        if table == "imu" and rate is not None and not PLAUSIBLE_RATE_HZ[0] < rate <= PLAUSIBLE_RATE_HZ[1]:
             yield Finding(
                 ReasonCode.IMPLAUSIBLE_RATE,
                 self.rows,
-                f"{name}: read as they are, the stamps make the IMU sample at {rate:.4g} Hz. Correct the unit of time "
-                "(csv.time_unit) or the log.",
+                f"{name}: read as they are, the stamps make the IMU sample at {rate:.4g} Hz{_other_unit(rate)}. "
+                "Correct the unit of time (csv.time_unit) or the log.",
                 fatal=True,
             )
         elif sensors and self.gaps and rate is not None and rate * GAP_NS * 1e-9 > stamps.PAUSE:
@@ -259,3 +280,11 @@ class TidySignal:
                 f"{name}: {table} pauses {self.gaps} time(s) for over {GAP_NS * 1e-9:.0f} s, at the longest for "
                 f"{self.longest_gap_ns * 1e-9:.3f} s; nothing is interpolated across.",
             )
+
+
+def _other_unit(rate_hz: float) -> str:
+    """Words on the rate of another unit of time that an IMU may well have."""
+    for factor, words in ((1e3, "1000 times finer (ms instead of s)"), (1e6, "10⁶ times finer (us instead of s)")):
+        if USUAL_RATE_HZ[0] <= rate_hz * factor <= USUAL_RATE_HZ[1]:
+            return f"; were their unit {words}, it would be {rate_hz * factor:.4g} Hz"
+    return ""

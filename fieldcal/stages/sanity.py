@@ -8,6 +8,7 @@ import numpy as np
 
 from fieldcal.estimation import faults
 from fieldcal.estimation.faults import Fault
+from fieldcal.estimation.gravity_seen import gravity_removed
 from fieldcal.geometry.earth_field import UNIT_IN_TESLA
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Sensor
@@ -34,7 +35,10 @@ def check_sensors(tables: Tables, s: SanitySettings) -> StageResult:
         if valid.sum() < faults.FEWEST_SAMPLES:
             continue
         stamps = tables[table]["t_ns"]
-        found += _faults_of(sensor, seconds(stamps, stamps[0])[valid], readings[valid], s)
+        triad_faults = _faults_of(sensor, seconds(stamps, stamps[0])[valid], readings[valid], s)
+        if sensor == Sensor.ACCELEROMETER and (removed := _gravity_removed(tables, s)):
+            triad_faults = [removed, *(f for f in triad_faults if f.code != ReasonCode.WRONG_UNIT)]
+        found += triad_faults
     worst = next((f for f in sorted(found, key=lambda f: not f.fatal)), None)
     return StageResult(
         {"faults": fault_rows(found)},
@@ -60,3 +64,20 @@ def _faults_of(sensor: Sensor, t: Array, readings: Array, s: SanitySettings) -> 
     dead = any(f.code in (ReasonCode.ALL_ZERO, ReasonCode.STUCK) and f.fatal for f in found)
     coarse = [] if dead else faults.coarse_faults(sensor, readings, unit)
     return [*found, *coarse, *([wrong] if wrong and not dead else []), *faults.sampling_faults(sensor, t)]
+
+
+def _gravity_removed(tables: Tables, s: SanitySettings) -> Fault | None:
+    """Whether gravity was taken off the accelerometer's readings, where the units of it and the gyroscope are known."""
+    factors = []
+    for sensor in (Sensor.GYROSCOPE, Sensor.ACCELEROMETER):
+        nominal = s.nominal_scale[sensor]
+        if s.units[sensor] == "counts" or nominal is None:
+            return None
+        factors.append(float(nominal[0]))
+    imu = tables["imu"]
+    rate, force = (matrix(imu, triad(sensor)) for sensor in (Sensor.GYROSCOPE, Sensor.ACCELEROMETER))
+    valid = np.isfinite(rate).all(axis=1) & np.isfinite(force).all(axis=1)
+    if valid.sum() < faults.FEWEST_SAMPLES:
+        return None
+    t = seconds(imu["t_ns"], imu["t_ns"][0])[valid]
+    return gravity_removed(t, rate[valid] * factors[0], force[valid] * factors[1], s.gravity_mps2)

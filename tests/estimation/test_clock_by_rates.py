@@ -242,6 +242,14 @@ def test_too_short_a_vps_record(clean: Record, samples: int) -> None:
     assert error.measured["n_vps"] == samples
 
 
+def test_a_day_of_pause_is_refused_and_takes_no_memory(clean: Record) -> None:
+    t, rate, stamps, q = clean
+    half = np.where(t > t[len(t) // 2], 86_400.0, 0.0)
+    error = refusal(t + half, rate, stamps, q)
+    assert error.reason_code == "gaps"
+    assert error.measured["span_s"] == pytest.approx(86_400.0 + t[-1] - t[0], rel=1e-9)
+
+
 @pytest.mark.parametrize("end", [0, -1])
 def test_an_outlier_at_either_end_is_masked(clean: Record, end: int) -> None:
     _, _, stamps, q = clean

@@ -14,7 +14,8 @@ from fieldcal.errors import UnreadableLog
 from fieldcal.logs import LogSummary, read_log
 from fieldcal.logs.csv.columns import IMU_DEFAULTS, Columns, declared_units, find_columns
 from fieldcal.logs.csv.dialect import Dialect, cells_of, find_dialect, is_number
-from fieldcal.logs.csv.rows import Losses, numbers_of, other_header, read_rows
+from fieldcal.logs.csv.losses import Losses
+from fieldcal.logs.csv.rows import numbers_of, other_header, read_rows
 from fieldcal.logs.csv.text import LineBlocks
 from fieldcal.logs.csv.units import is_units_row, sensor_unit, time_unit
 from fieldcal.reason_codes import ReasonCode
@@ -28,15 +29,15 @@ def dialect(text: str, separator: str | None = None, decimal: str | None = None)
 
 def test_where_the_data_begin() -> None:
     assert dialect("t,gx\n1,2\n") == Dialect(",", ".", ("t", "gx"), b"t,gx", None, 1)
-    assert dialect("# c\n\nt,gx\ns,rad/s\n1,2\n") == Dialect(",", ".", ("t", "gx"), b"t,gx", ("s", "rad/s"), 4)
+    assert dialect("# c\n\nt,gx\ns,rad/s\n1,2\n") == Dialect(",", ".", ("t", "gx"), b"t,gx", ("s", "rad/s"), 4, 0, 3)
     assert dialect("t;gx\n\n# pause\ns;rad/s\n1;2\n") == Dialect(";", ".", ("t", "gx"), b"t;gx", ("s", "rad/s"), 4)
     assert dialect("t,gx\ns,rad/s,x\n1,2\n").unit_row is None
-    assert dialect("sep=;\nt;gx\n1;2\n") == Dialect(";", ".", ("t", "gx"), b"t;gx", None, 2)
+    assert dialect("sep=;\nt;gx\n1;2\n") == Dialect(";", ".", ("t", "gx"), b"t;gx", None, 2, 0, 2)
     assert dialect('"SEP=|"\nt|gx\n1|2\n').separator == "|"
     assert dialect("sep=;\nt,gx\n1,2\n", ",").separator == ","
     assert dialect("sep=;\n").names == ("sep=", "")
     assert dialect("sep=;\nt;gx\n").names == ("t", "gx")
-    assert dialect("# x\n# t,gx\n0.1,2\n") == Dialect(",", ".", ("t", "gx"), b"", None, 2)
+    assert dialect("# x\n# t,gx\n0.1,2\n") == Dialect(",", ".", ("t", "gx"), b"", None, 2, 0, 3)
     assert dialect("t  gx\n1 2\n") == Dialect(" ", ".", ("t", "gx"), b"t gx", None, 1)
     assert dialect('"t","gx"\n1,2\n').header == b"t,gx"
     assert dialect("\ufefft,gx\n1,2\n").names == ("t", "gx")

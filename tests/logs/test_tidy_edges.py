@@ -133,6 +133,42 @@ def test_the_first_of_each_stamp_is_kept(held: int | None) -> None:
     assert signal.conflicts == 4000
 
 
+def test_of_rounded_stamps_the_kept_reading_is_as_old_as_its_stamp() -> None:
+    """185 Hz, stamps of two decimals: the kept readings' true times are on average those of their stamps."""
+    true = np.rint(np.arange(7400) / 185.0 * S).astype(np.int64)
+    rounded = (true + S // 200) // (S // 100) * (S // 100)
+    columns = {**imu(rounded), "gyroscope_x": true.astype(float)}
+    frame, signal = tidied(columns)
+    late = frame["gyroscope_x"].to_numpy() - frame["t_ns"].to_numpy()
+    assert abs(late.mean()) < 0.05e-3 * S
+    first = np.unique(rounded, return_index=True)[1]
+    assert (true[first] - rounded[first]).mean() < -2e-3 * S
+    assert frame["t_ns"].to_list() == np.unique(rounded).tolist()
+    assert signal.conflicts == 7400 - len(first)
+    assert "the middle one of each stamp was kept" in sentence(signal, "repeated_stamps")
+
+
+def test_two_sensors_in_one_table_are_not_mixed() -> None:
+    """Every stamp twice, but for a few lost rows: the first of each is kept."""
+    t_ns = np.delete(np.repeat(steady(500), 2), np.arange(20) * 50)
+    columns = imu(t_ns)
+    frame, signal = tidied(columns)
+    first = np.unique(t_ns, return_index=True)[1]
+    assert frame["gyroscope_x"].to_list() == columns["gyroscope_x"][first].tolist()
+    assert "the first of each stamp was kept" in sentence(signal, "repeated_stamps")
+
+
+def test_milliseconds_read_as_seconds_are_told() -> None:
+    _, signal = tidied(imu(steady(100, S)))
+    assert "at 1 Hz; were their unit 1000 times finer (ms instead of s), it would be 1000 Hz" in sentence(
+        signal, "implausible_rate"
+    )
+    _, signal = tidied(imu(steady(100, 5000 * S)))
+    assert "10⁶ times finer (us instead of s), it would be 200 Hz" in sentence(signal, "implausible_rate")
+    _, signal = tidied(imu(steady(100, 1000)))
+    assert "were their unit" not in sentence(signal, "implausible_rate")
+
+
 @pytest.mark.parametrize(("repeats", "code"), [(500, "repeated_stamps"), (501, "clock_stands")])
 def test_a_clock_stands_when_most_rows_repeat_a_stamp(repeats: int, code: str) -> None:
     """Of 1000."""
@@ -199,9 +235,9 @@ def test_pauses_are_counted_over_what_is_handed_on_in_parts() -> None:
 
 @pytest.mark.parametrize(
     ("step_ns", "plausible"),
-    [(S, True), (1_050_000_000, False), (20_000, True), (19_000, False), (STEP_NS, True)],
+    [(990_000_000, True), (S, False), (1_050_000_000, False), (20_000, True), (19_000, False), (STEP_NS, True)],
 )
-def test_an_imu_samples_once_to_fifty_thousand_times_a_second(step_ns: int, plausible: bool) -> None:
+def test_an_imu_samples_more_than_once_and_up_to_fifty_thousand_times_a_second(step_ns: int, plausible: bool) -> None:
     _, signal = tidied(imu(steady(100, step_ns)))
     assert signal.rate_hz() == pytest.approx(S / step_ns, rel=1e-12)
     assert ("implausible_rate" in told(signal)) == (not plausible)

@@ -35,6 +35,7 @@ from fieldcal.reason_codes import ReasonCode
 FINE_CUTOFF_HZ = 8.0
 REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock
 # Chance peaks of unrelated motions reach 0.9 in the coarse correlation; the vector fit tells them apart.
+MOST_GRID_PER_SAMPLE = 20  # a grid over hours of which minutes were recorded fills the memory with gaps
 MIN_EXPLAINED, MAX_SKEW_PPM, MAX_LAG_SD_S = 0.6, 2000.0, 0.01
 SURELY_EXPLAINED = 0.9  # share from which an impossible clock, not another motion, is what differs
 
@@ -230,7 +231,8 @@ def synchronise(
     Raises
     ------
     UnusableFlight
-        `vps_too_short`, `flat_peak` (peak below `min_peak`), `ambiguous_peak` (runner-up within 2 % of the peak),
+        `vps_too_short`, `gaps` (hours of pauses for minutes of samples),
+        `flat_peak` (peak below `min_peak`), `ambiguous_peak` (runner-up within 2 % of the peak),
         `clock_rates_differ`, `not_the_same_motion` (the vector fit fails at the best lag); `measured` has the numbers.
 
     Notes
@@ -243,6 +245,14 @@ def synchronise(
             ReasonCode.VPS_TOO_SHORT, "The VPS or IMU record is too short to synchronise.", {"n_vps": len(t_vps)}
         )
     interval = float(max(np.median(np.diff(t_imu)), 1e-3))
+    longest = float(max(t_imu[-1] - t_imu[0], t_vps[-1] - t_vps[0]))
+    if longest > MOST_GRID_PER_SAMPLE * interval * (len(t_imu) + len(t_vps)):
+        raise UnusableFlight(
+            ReasonCode.GAPS,
+            f"The stamps span {longest:.0f} s, of which little was recorded: the pauses are too long to synchronise "
+            "across. Split the log there.",
+            {"span_s": longest},
+        )
     imu = imu_rates(t_imu, rate_imu, interval)
     vps = vps_rates(t_vps, q_vps, interval, max_gap_s=max_gap_s)
     imu, vps = (_smoothed(s) for s in (imu, vps))

@@ -8,9 +8,12 @@ from dataclasses import dataclass
 
 from fieldcal.config.values import Paths
 from fieldcal.errors import UnreadableLog
+from fieldcal.logs.csv.attitude import ANGLES, quaternion_by_names
 from fieldcal.logs.csv.dialect import Dialect
 from fieldcal.logs.csv.units import sensor_unit
 from fieldcal.logs.interface import LogSummary
+from fieldcal.logs.joining import INERTIAL
+from fieldcal.names import SENSORS
 from fieldcal.reason_codes import ReasonCode
 
 IMU_DEFAULTS: dict[str, tuple[str, ...]] = {
@@ -23,8 +26,19 @@ IMU_DEFAULTS: dict[str, tuple[str, ...]] = {
 }
 VPS_DEFAULTS: dict[str, tuple[str, ...]] = {
     "quaternion_xyzw": ("qx", "qy", "qz", "qw"),
+    "quaternion_wxyz": (),
+    "roll_pitch_yaw": (),
     "position": ("px", "py", "pz"),
 }
+AXES: dict[str, tuple[str, ...]] = {key: tuple(f"{key}_{axis}" for axis in "xyz") for key in SENSORS}
+POWER_COLUMNS = {"current": ("current_a",), "throttle": ("throttle",)}
+VPS_COLUMNS = {
+    "quaternion_xyzw": ("qx", "qy", "qz", "qw"),
+    "roll_pitch_yaw": ANGLES,
+    "position": ("px_m", "py_m", "pz_m"),
+}
+OPTIONAL = ("temperature", "current", "throttle", "position")
+"""What a log may lack although it is configured."""
 TIME_DEFAULTS = tuple(
     stem + suffix for stem in ("t", "time", "timestamp") for suffix in ("_s", "", "_ms", "_us", "_ns")
 )
@@ -64,6 +78,69 @@ def find_columns(
         return Columns(_position(str(configured["t"]), dialect, f"csv.{table}.t", log_name), values)
     times = [name for name in TIME_DEFAULTS if name in dialect.names]
     return Columns(_position(times[0], dialect, f"csv.{table}.t", log_name) if times else None, values)
+
+
+def signal_groups(
+    imu: Columns | None, vps: Columns | None, *, apart: bool
+) -> list[tuple[str, list[tuple[str, tuple[str, ...]]]]]:
+    """Signal table → (key of the column map, output columns). `apart`: inertial sensors have rows of their own."""
+    own = imu.values if imu is not None else {}
+    reference = vps.values if vps is not None else {}
+    inertial = [(key, AXES[key]) for key in INERTIAL if key in own]
+    return [
+        *([(key, [(key, axes)]) for key, axes in inertial] if apart else [("imu", inertial)]),
+        ("magnetometer", [("magnetometer", AXES["magnetometer"])] if "magnetometer" in own else []),
+        ("temperature", [("temperature", ("temperature_degc",))] if "temperature" in own else []),
+        ("power", [(key, outs) for key, outs in POWER_COLUMNS.items() if key in own]),
+        ("vps", [(key, outs) for key, outs in VPS_COLUMNS.items() if key in reference]),
+    ]
+
+
+def attitude_columns(dialect: Dialect, columns: Columns) -> Columns:
+    """Columns of a VPS with at most one attitude: the configured one, else the default, else one that names tell.
+
+    A quaternion's columns are in the order x, y, z, w.
+    """
+    values = dict(columns.values)
+    if "quaternion_wxyz" in values:
+        w, *xyz = values.pop("quaternion_wxyz")
+        values["quaternion_xyzw"] = (*xyz, w)
+    elif "roll_pitch_yaw" in values:
+        values.pop("quaternion_xyzw", None)
+    elif "quaternion_xyzw" not in values:
+        named = quaternion_by_names(dialect.names)
+        if named:
+            values["quaternion_xyzw"] = named
+    return Columns(columns.time, values)
+
+
+def without_absent(
+    dialect: Dialect, configured: Mapping[str, Paths], table: str, summary: LogSummary, log_name: str
+) -> dict[str, Paths]:
+    """The configured columns but optional ones that the file lacks, which are told."""
+    kept = dict(configured)
+    for key in OPTIONAL:
+        wanted = configured.get(key, ())
+        absent = [name for name in ((wanted,) if isinstance(wanted, str) else wanted) if name not in dialect.names]
+        if absent:
+            del kept[key]
+            summary.add(
+                ReasonCode.MISSING_COLUMN,
+                1,
+                f"{log_name} has no column {absent[0]!r} (csv.{table}.{key}); {_nearest(absent[0], dialect.names)}. It "
+                f"is read without its {key}.",
+            )
+    return kept
+
+
+def no_attitude(dialect: Dialect, log_name: str) -> UnreadableLog:
+    """The refusal of a VPS's file whose attitude is not understood."""
+    listed = ", ".join(name for name in dialect.names[:20] if name)
+    return UnreadableLog(
+        ReasonCode.MISSING_COLUMN,
+        f"{log_name} has no known quaternion columns; it has {listed}. Name them as csv.vps.quaternion_xyzw or "
+        "csv.vps.quaternion_wxyz, or angles (yaw, pitch, roll applied in this order) as csv.vps.roll_pitch_yaw.",
+    )
 
 
 def declared_units(dialect: Dialect, columns: Columns, summary: LogSummary, log_name: str) -> dict[str, str]:

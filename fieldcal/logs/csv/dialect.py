@@ -15,10 +15,14 @@ SEPARATORS = ("\t", ";", ",")
 WHITESPACE = " "
 QUOTE = '"'
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$|[+-]?(nan|inf|infinity)$", re.IGNORECASE)
-_COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?$")
+COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?$")
 _SEPARATOR_LINE = re.compile(r'"?sep=([,;\t|])"?$', re.IGNORECASE)
 _LINES_LOOKED_AT = 50
+_PREAMBLE_LINES_CAP = 1000
+COMMENTS = ("#", "//")
 COLUMNS_CAP = 10_000
+LEAST_FIELDS = 4
+"""A time and the axes of one sensor: rows of fewer cells show no header below the first line."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,8 @@ class Dialect:
     """What a look at the first lines found.
 
     `first_row`: number of lines before the first row of data. `header`: the header line as it stands.
-    `unit_row`: cells of the units row, or None.
+    `unit_row`: cells of the units row, or None. `preamble`: number of lines above the header that are neither rows nor
+    comments. `header_line`: the header's line, counted from 1.
     """
 
     separator: str
@@ -35,6 +40,8 @@ class Dialect:
     header: bytes
     unit_row: tuple[str, ...] | None
     first_row: int
+    preamble: int = 0
+    header_line: int = 1
 
     @property
     def fields(self) -> int:
@@ -65,14 +72,16 @@ def find_dialect(block: bytes, log_name: str, separator: str | None, decimal: st
     UnreadableLog
         `missing_header`, `not_text`, `no_rows`, `too_many_columns`.
     """
-    lines = block.split(b"\n", _LINES_LOOKED_AT * 4)[: _LINES_LOOKED_AT * 4]
+    lines = block.split(b"\n", _PREAMBLE_LINES_CAP)[:_PREAMBLE_LINES_CAP]
     texts = [_text(line) for line in lines]
-    body = [number for number, text in enumerate(texts) if text.strip() and not text.lstrip().startswith("#")]
+    body = [number for number, text in enumerate(texts) if text.strip() and not text.lstrip().startswith(COMMENTS)]
     if not body:
         raise UnreadableLog(ReasonCode.NO_ROWS, f"{log_name} holds no rows. Nothing was recorded.")
     declared = _SEPARATOR_LINE.match(texts[body[0]].strip())
     if declared and len(body) > 1:
         separator, body = separator or declared[1], body[1:]
+    preamble = header_place([texts[number] for number in body], separator, decimal)
+    body = body[preamble:]
     place = body[0]
     if b"\0" in lines[place] or (not texts[place].replace("\t", " ").isprintable()):
         raise UnreadableLog(
@@ -83,10 +92,10 @@ def find_dialect(block: bytes, log_name: str, separator: str | None, decimal: st
     names, header, first_row = cells_of(texts[place], found), lines[place], place + 1
     if found == WHITESPACE or QUOTE in texts[place]:
         header = found.join(names).encode()
-    point = _decimal(data, found, decimal)
+    point = decimal or _decimal(data, found)
     if all(is_number(cell.replace(point, ".")) or not cell for cell in names):
-        commented = [text for text in texts[:place] if text.lstrip().startswith("#")]
-        names = cells_of(commented[-1].lstrip("# "), found) if commented else []
+        commented = [text for text in texts[:place] if text.lstrip().startswith(COMMENTS)]
+        names = cells_of(commented[-1].lstrip("#/ "), found) if commented else []
         if len(names) != len(cells_of(texts[place], found)):
             raise UnreadableLog(
                 ReasonCode.MISSING_HEADER,
@@ -103,7 +112,43 @@ def find_dialect(block: bytes, log_name: str, separator: str | None, decimal: st
         cells = cells_of(data[0], found)
         if len(cells) == len(names) and is_units_row(cells):
             unit_row, first_row = tuple(cells), body[1] + 1
-    return Dialect(found, point, tuple(names), header, unit_row, first_row)
+    return Dialect(found, point, tuple(names), header, unit_row, first_row, preamble, place + 1)
+
+
+def header_place(texts: list[str], separator: str | None, decimal: str | None) -> int:
+    """Which of the lines (neither empty nor comments) is the header: the first, or one that rows of numbers follow.
+
+    Exporters put a preamble above the header ("key,value" lines, a title). It is looked for only where the first line
+    does not fit what follows it, and only taken where a line of names with as many cells as the rows is found.
+    """
+    data = texts[1:_LINES_LOOKED_AT]
+    first = separator or _separator(texts[0], data)
+    fields = len(cells_of(texts[0], first))
+    if not data or sum(_is_row(line, first, fields, decimal) for line in data) > len(data) // 2:
+        return 0
+    for place in range(1, len(texts) - 1):
+        for candidate in (separator,) if separator else (*SEPARATORS, WHITESPACE):
+            fields = len(cells_of(texts[place], candidate))
+            rows = texts[place : place + _LINES_LOOKED_AT]
+            if fields < LEAST_FIELDS or not _is_row(rows[0], candidate, fields, decimal):
+                continue
+            if sum(_is_row(line, candidate, fields, decimal) for line in rows) <= len(rows) // 2:
+                continue
+            above = place - 1
+            if above and is_units_row(cells_of(texts[above], candidate)):
+                above -= 1
+            names = cells_of(texts[above], candidate)
+            trailing = fields - len(names) in (0, 1)
+            return above if trailing and any(name and not is_number(name) for name in names) else 0
+    return 0
+
+
+def _is_row(line: str, separator: str, fields: int, decimal: str | None) -> bool:
+    """Whether a line is a row of so many cells, more of them numbers than words."""
+    cells = cells_of(line, separator)
+    filled = [cell for cell in cells if cell]
+    numbers = sum(is_number(cell) or (decimal != "." and bool(COMMA_NUMBER.match(cell))) for cell in filled)
+    return len(cells) - fields in (0, 1) and 2 * numbers > len(filled)
 
 
 def _text(line: bytes) -> str:
@@ -122,10 +167,9 @@ def _separator(header: str, data: list[str]) -> str:
     return present[0] if present else WHITESPACE
 
 
-def _decimal(data: list[str], separator: str, configured: str | None) -> str:
-    if configured or separator == ",":
-        return configured or "."
+def _decimal(data: list[str], separator: str) -> str:
+    # Where commas separate too, a cell holds one only in quotes.
     cells = [cell for line in data for cell in cells_of(line, separator)]
-    commas = sum(bool(_COMMA_NUMBER.match(cell)) for cell in cells)
+    commas = sum(bool(COMMA_NUMBER.match(cell)) for cell in cells)
     points = sum("." in cell and is_number(cell) for cell in cells)
     return "," if commas > points else "."

@@ -5,39 +5,17 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from fieldcal.logs.csv.dialect import QUOTE, WHITESPACE, Dialect, is_number
+from fieldcal.logs.csv.dialect import COMMA_NUMBER, QUOTE, WHITESPACE, Dialect, is_number
+from fieldcal.logs.csv.losses import Losses
 from fieldcal.reason_codes import ReasonCode
 
 MISSING_CELLS = ("", "nan", "null", "na", "n/a", "none", "-")
-_LINE_FEED, _COMMENT = 10, ord("#")
-
-
-@dataclass
-class Losses:
-    """Rows left out: reason -> how many, and the number of the first line concerned (counted from 1)."""
-
-    counts: dict[ReasonCode, int] = field(default_factory=dict)
-    first_lines: dict[ReasonCode, int] = field(default_factory=dict)
-    _last_lines: dict[ReasonCode, NDArray[np.int64]] = field(default_factory=dict)
-
-    def add(self, reason: ReasonCode, lines: NDArray[np.int64]) -> None:
-        """Count `lines` (ascending numbers) under `reason`; a line that several tables lose counts once."""
-        last = self._last_lines.get(reason)
-        new = lines if last is None else np.setdiff1d(lines, last, assume_unique=True)
-        if new.size:
-            self.counts[reason] = self.counts.get(reason, 0) + int(new.size)
-            self.first_lines[reason] = min(int(new[0]), self.first_lines.get(reason, int(new[0])))
-            self._last_lines[reason] = new if last is None else np.concatenate([last, new])
-
-    def next_block(self) -> None:
-        """The lines to come are others than those met so far."""
-        self._last_lines.clear()
+_LINE_FEED, _COMMENT, _SLASH = 10, ord("#"), ord("/")
 
 
 def read_rows(
@@ -50,7 +28,7 @@ def read_rows(
     """
     if dialect.separator == WHITESPACE:
         block = re.sub(rb"(?m)^ | $", b"", re.sub(rb"[ \t]+", b" ", block))
-    block, unclosed = _unquoted(block, dialect.separator)
+    block, unclosed = _unquoted(block, dialect)
     data = np.frombuffer(block, np.uint8)
     ends = np.flatnonzero(data == _LINE_FEED)
     starts = np.concatenate(([0], ends[:-1] + 1))
@@ -67,7 +45,7 @@ def read_rows(
     kept = ~(silent | damaged | ragged)
     if not kept.all():
         block = data[np.repeat(kept, ends - starts + 1)].tobytes()
-    if dialect.decimal != ".":
+    if dialect.decimal not in (".", dialect.separator):
         block = block.replace(dialect.decimal.encode(), b".")
     return _cells(block, dialect, columns, int(kept.sum())), numbers[kept]
 
@@ -91,6 +69,8 @@ def other_header(frame: pl.DataFrame, dialect: Dialect) -> int | None:
     """
     own = {name: dialect.names[int(name)] for name in frame.columns}
     names = [name for name in dialect.names if name and not is_number(name)]
+    if not own:
+        return None
     named = frame.select(pl.sum_horizontal(pl.col(*own).str.strip_chars().is_in(names)).alias("n")).to_series()
     for place in (named * 2 > len(own)).arg_true().to_list():
         if any(cell is None or cell.strip() != own[name] for name, cell in frame.row(place, named=True).items()):
@@ -98,11 +78,14 @@ def other_header(frame: pl.DataFrame, dialect: Dialect) -> int | None:
     return None
 
 
-def _unquoted(block: bytes, separator: str) -> tuple[bytes, list[int]]:
+def _unquoted(block: bytes, dialect: Dialect) -> tuple[bytes, list[int]]:
     """The block with quotes resolved, and the positions of lines whose quotes do not close.
 
-    A separator inside quotes becomes a space: quoted cells are words, which are not read.
+    A decimal comma inside quotes becomes a point where commas separate the cells too. Any other separator inside
+    quotes becomes a space: such cells are words, which are not read.
     """
+    separator = dialect.separator
+    comma = dialect.decimal == separator == ","
     if QUOTE.encode() not in block:
         return block, []
     lines = block.split(b"\n")
@@ -119,6 +102,8 @@ def _unquoted(block: bytes, separator: str) -> tuple[bytes, list[int]]:
         except csv.Error:
             unclosed.append(number)
             continue
+        if comma:
+            cells = [cell.replace(",", ".") if COMMA_NUMBER.match(cell.strip()) else cell for cell in cells]
         text = separator.join(cell.replace(separator, " ").replace("\n", " ") for cell in cells)
         lines[number] = text.encode("utf-8", "surrogateescape")
     return b"\n".join(lines), unclosed
@@ -135,6 +120,7 @@ def _silent(
 ) -> NDArray[np.bool_]:
     """Lines that are no rows and lose nothing: empty, comments, the header once more."""
     silent: NDArray[np.bool_] = (ends == starts) | (data[starts] == _COMMENT)
+    silent |= (data[starts] == _SLASH) & (data[np.minimum(starts + 1, len(data) - 1)] == _SLASH)
     blank = (data[starts] == ord(" ")) | (data[starts] == ord("\t"))
     for line in np.flatnonzero((ends - starts < 64) & blank & ~silent).tolist():
         silent[line] = not block[starts[line] : ends[line]].strip()

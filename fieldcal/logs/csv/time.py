@@ -13,6 +13,8 @@ NANOSECONDS_OF = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 
 _DECIMAL = r"^([+-]?)(\d*)(?:\.(\d*))?$"
 _ISO = r"^(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d+))?\s*(Z|z|[+-]\d\d:?\d\d)?$"
+_TIME_OF_DAY = r"^(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d+))?$"
+_CLOCK_PARTS = ((1, "hours"), (2, "minutes"), (3, "seconds"))
 _LARGEST = 2**63 - 1
 
 
@@ -21,12 +23,20 @@ def looks_iso8601(text: str) -> bool:
     return bool(pl.select(pl.lit(text.strip()).str.contains(_ISO)).item())
 
 
+def looks_time_of_day(text: str) -> bool:
+    """Whether a cell is a time of day, HH:MM:SS with or without a fraction."""
+    return bool(pl.select(pl.lit(text.strip()).str.contains(_TIME_OF_DAY)).item())
+
+
 def nanoseconds(cells: pl.Series, unit: str) -> pl.Series:
-    """Int64 nanoseconds of time cells in `unit` ("s", "ms", "us", "ns", "iso8601"); null where a cell is no time.
+    """Int64 nanoseconds of time cells in `unit` ("s", "ms", "us", "ns", "iso8601", "time_of_day": HH:MM:SS.fff since
+    midnight); null where a cell is no time.
 
     Digits below the nanosecond are rounded half up in size. ISO 8601 without an offset is taken for UTC.
     """
     stripped = cells.str.strip_chars()
+    if unit == "time_of_day":
+        return _from_time_of_day(stripped)
     return _from_iso(stripped) if unit == "iso8601" else _from_decimal(stripped, NANOSECONDS_OF[unit])
 
 
@@ -96,3 +106,15 @@ def _from_iso(cells: pl.Series) -> pl.Series:
     seconds = pl.col("seconds") - east_s
     usable = seconds.abs() < _LARGEST // 10**9
     return parts.select(pl.when(usable).then(seconds * 10**9 + below).otherwise(None).alias("t_ns"))["t_ns"]
+
+
+def _from_time_of_day(cells: pl.Series) -> pl.Series:
+    parts = cells.to_frame("cell").select(
+        *(pl.col("cell").str.extract(_TIME_OF_DAY, n).cast(pl.Int64).alias(name) for n, name in _CLOCK_PARTS),
+        pl.col("cell").str.extract(_TIME_OF_DAY, 4).fill_null("").str.pad_end(10, "0").alias("fraction"),
+    )
+    seconds = pl.col("hours") * 3600 + pl.col("minutes") * 60 + pl.col("seconds")
+    below = pl.col("fraction").str.slice(0, 9).cast(pl.Int64) + (pl.col("fraction").str.slice(9, 1) >= "5").cast(
+        pl.Int64
+    )
+    return parts.select(pl.when(pl.col("hours") < 24).then(seconds * 10**9 + below).alias("t_ns"))["t_ns"]

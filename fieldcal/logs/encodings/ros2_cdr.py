@@ -90,8 +90,10 @@ class CdrDecoder:
         The definition cannot be followed as far as the wanted fields.
     """
 
+    _head_bytes = ENCAPSULATION_BYTES
+
     def __init__(self, name: str, text: str, wants: Mapping[str, Want]) -> None:
-        leaves = _leaves(name, text)
+        leaves = self._leaves(name, text)
         self._steps, places = _runs(leaves)
         self._widths = {value: want.width for value, want in wants.items()}
         stamp = _stamp_paths(places)
@@ -105,6 +107,9 @@ class CdrDecoder:
         blocked = [step for step in self._steps if isinstance(step, Opaque)]
         if blocked:
             raise UnsupportedSchema(f"{name}: {blocked[0].path} has a variable layout and stands before a wanted field")
+
+    def _leaves(self, name: str, text: str) -> tuple[Leaf, ...]:
+        return _leaves(name, text)
 
     def decode(self, data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64]) -> Decoded:
         """See `Decoder.decode`."""
@@ -129,7 +134,7 @@ class CdrDecoder:
         largest_alignment: int,
     ) -> Decoded:
         while True:
-            bodies, limits = starts[kept] + ENCAPSULATION_BYTES, sizes[kept] - ENCAPSULATION_BYTES
+            bodies, limits = starts[kept] + self._head_bytes, sizes[kept] - self._head_bytes
             try:
                 values = self._values(data, bodies, limits, order, largest_alignment)
                 break
@@ -174,7 +179,7 @@ class CdrDecoder:
         largest_alignment: int,
         cursor: Cursor,
     ) -> Cursor:
-        cursor = _aligned(cursor, 4)
+        cursor = _aligned(cursor, min(4, largest_alignment))
         _require(cursor + 4, limits)
         counts = _collapsed(gather(data, bodies + cursor, np.dtype(order + "u4")).astype(np.int64))
         cursor = cursor + 4
@@ -209,6 +214,25 @@ class CdrDecoder:
             else:
                 value = values.setdefault(pick.name, np.empty((len(places), width)))
                 value[:, pick.to : pick.to + pick.count] = got.reshape(len(places), pick.count)
+
+
+class Ros1Decoder(CdrDecoder):
+    """Reads `wants` from messages in ROS 1 serialisation: little-endian, without padding and without a head.
+
+    Parameters and errors are those of `CdrDecoder`; the definition is needed.
+    """
+
+    _head_bytes = 0
+
+    def _leaves(self, name: str, text: str) -> tuple[Leaf, ...]:
+        try:
+            return flatten(name, text)
+        except (DefinitionError, KeyError) as error:
+            raise UnsupportedSchema(f"{name}: {error}") from error
+
+    def decode(self, data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64]) -> Decoded:
+        """See `Decoder.decode`."""
+        return self._decode_kind(data, starts, sizes, np.arange(len(starts), dtype=np.intp), "<", 1)
 
 
 def _leaves(name: str, text: str) -> tuple[Leaf, ...]:

@@ -96,6 +96,8 @@ def flatten(name: str, text: str) -> tuple[Leaf, ...]:
 def _parse(name: str, text: str) -> dict[str, list[_Field]]:
     definitions = {"builtin_interfaces/Time": _fields(BUILTIN["builtin_interfaces/Time"])}
     definitions["builtin_interfaces/Duration"] = definitions["builtin_interfaces/Time"]
+    # ROS 1 has them as types of their own.
+    definitions["time"] = definitions["duration"] = _fields("uint32 sec\nuint32 nanosec")
     for number, part in enumerate(_SEPARATOR.split(text)):
         lines = part.strip().splitlines()
         if number and lines and lines[0].startswith("MSG:"):

@@ -12,7 +12,9 @@ from fieldcal.config.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.encodings.decoded import COMPONENTS, Decoded
 from fieldcal.logs.interface import Batch, Columns, LogSummary, logged_units, stamps_are_epoch
+from fieldcal.logs.joining import INERTIAL, SensorJoin
 from fieldcal.logs.mcap.file import Block, McapFile
+from fieldcal.logs.mcap.frames import STAMPED_TYPES, of_frame
 from fieldcal.logs.mcap.records import HEAD_BYTES, MESSAGE_HEAD_BYTES, gather
 from fieldcal.logs.mcap.report import Definitions, report
 from fieldcal.logs.mcap.roles import METADATA_NAME, SI_TYPES, Source, choose_sources
@@ -21,7 +23,8 @@ from fieldcal.reason_codes import ReasonCode
 
 SI_UNITS = {"gyroscope": "rad/s", "accelerometer": "m/s^2", "magnetometer": "T"}
 CHANNELS_CAP = 4096
-_U2, _U8 = np.dtype("<u2"), np.dtype("<u8")
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_U2, _U4, _U8 = np.dtype("<u2"), np.dtype("<u4"), np.dtype("<u8")
 
 
 class McapLog:
@@ -38,7 +41,7 @@ class McapLog:
     ------
     UnreadableLog
         `empty_file`, `not_mcap`, `not_readable`, `no_messages`, `too_many_channels`, `missing_topic`,
-        `missing_field`, `missing_sensor`, `unsupported_schema`; from `batches()` only `no_messages`.
+        `missing_field`, `missing_sensor`, `unsupported_schema`; from `batches()` only `no_messages`, `several_units`.
     """
 
     def __init__(self, path: Path, vehicle: Vehicle) -> None:
@@ -63,9 +66,12 @@ class McapLog:
                 "damaged, or no flight log. Check what it is.",
             )
         self._file.definitions = definitions
-        self._sources = choose_sources(definitions, vehicle.mcap, self.summary, self._name)
+        counts = self._file.statistics.channel_message_counts if self._file.statistics else None
+        self._sources = choose_sources(definitions, vehicle.mcap, self.summary, self._name, counts)
         self._malformed: dict[str, int] = {}
         self._unstamped: dict[str, int] = {}
+        self._packed = 0
+        self._join = SensorJoin()
 
     def batches(self) -> Iterator[Batch]:
         """Signal batches in file order, one per topic and chunk. May be iterated once."""
@@ -76,17 +82,32 @@ class McapLog:
                     starts = block.starts[channels == channel_id]
                     if not starts.size:
                         continue
-                    decoded = decoder.decode(block.data, *_payloads(block, starts))
+                    payloads, sizes = _payloads(block, starts)
+                    if source.role == "imu" and source.type_name in STAMPED_TYPES:
+                        chosen = of_frame(block.data, payloads, sizes, self._vehicle.mcap.frame_id, source, self._name)
+                        starts, payloads, sizes = starts[chosen], payloads[chosen], sizes[chosen]
+                        if not starts.size:
+                            continue
+                    decoded = decoder.decode(block.data, payloads, sizes)
                     if len(decoded.kept) < len(starts):
                         lost = len(starts) - len(decoded.kept)
+                        self._packed += int(_packed(block.data, payloads, sizes).sum())
                         self._malformed[source.topic] = self._malformed.get(source.topic, 0) + lost
                     for table, columns in self._tables(source, decoded, block, starts):
                         self.summary.count_rows(table, columns)
                         yield table, columns
+        joined = self._join.joined(self._name)
+        if joined is not None:
+            columns, finding = joined
+            self.summary.findings.append(finding)
+            self.summary.count_rows("imu", columns)
+            yield "imu", columns
         self._finish()
 
     def _tables(self, source: Source, decoded: Decoded, block: Block, starts: NDArray[np.int64]) -> Iterator[Batch]:
         t_ns = decoded.stamp_ns
+        if t_ns is not None and len(t_ns) > 1 and not t_ns.any():
+            t_ns = None  # a driver that never fills them in
         if t_ns is None or self._by_log_time:
             if t_ns is None and not self._by_log_time:
                 self._unstamped[source.topic] = self._unstamped.get(source.topic, 0) + len(decoded.kept)
@@ -105,6 +126,8 @@ class McapLog:
                 yield from _finite("magnetometer", _columns(t_ns, values, ["magnetometer"]))
             if "temperature" in values and "temperature" not in others:
                 yield from _finite("temperature", {"t_ns": t_ns, "temperature_degc": values["temperature"]})
+        elif source.role in INERTIAL:
+            self._join.add(source.role, t_ns, values[source.role])
         elif source.role == "magnetometer":
             yield "magnetometer", _columns(t_ns, values, ["magnetometer"])
         elif source.role == "temperature":
@@ -153,14 +176,25 @@ class McapLog:
                 count,
                 f"{self._name}: messages on {topic} carry no stamp of their own; the time of recording is used.",
             )
+        if self._packed:
+            self.summary.add(
+                ReasonCode.PACKED_MESSAGES,
+                self._packed,
+                f"{self._name}: the payloads of {self._packed} messages are zstd-compressed one by one (rosbag2's "
+                'compression mode "message"), which is not read. Convert the log: ros2 bag convert, compression mode '
+                "none or file.",
+                loses_data=True,
+            )
         for name, pairs in file.metadata.items():
             prefix = "" if name == METADATA_NAME else f"{name}."
             self.summary.metadata |= {prefix + key: value for key, value in pairs.items()}
         if not {"imu", "magnetometer"} & self.summary.counts.keys():
+            packed = [finding for finding in self.summary.findings if finding.code == ReasonCode.PACKED_MESSAGES]
+            told = packed or self.summary.findings
             raise UnreadableLog(
                 ReasonCode.NO_MESSAGES,
                 f"{self._name}: not one message of {', '.join(source.topic for source in self._sources)} could be read"
-                + (f" ({self.summary.findings[0].sentence})" if self.summary.findings else "."),
+                + (f" ({told[0].sentence})" if told else "."),
             )
 
 
@@ -175,6 +209,13 @@ def _collected(path: Path) -> Definitions:
 def _payloads(block: Block, starts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     sizes = gather(block.data, starts + 1, _U8).view(np.int64) - MESSAGE_HEAD_BYTES
     return starts + HEAD_BYTES + MESSAGE_HEAD_BYTES, sizes
+
+
+def _packed(data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which payloads begin as a zstd frame does."""
+    packed = sizes >= len(ZSTD_MAGIC)
+    packed[packed] = gather(data, starts[packed], _U4) == int.from_bytes(ZSTD_MAGIC, "little")
+    return packed
 
 
 def _columns(t_ns: NDArray[np.int64], values: dict[str, NDArray[np.float64]], sensors: Sequence[str]) -> Columns:

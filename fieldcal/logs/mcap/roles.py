@@ -11,11 +11,12 @@ from fieldcal.errors import UnreadableLog
 from fieldcal.logs.encodings.decoded import Decoder, MissingField, UnsupportedSchema, Want
 from fieldcal.logs.encodings.json_messages import JsonDecoder
 from fieldcal.logs.encodings.protobuf_messages import ProtobufDecoder
-from fieldcal.logs.encodings.ros2_cdr import CdrDecoder
-from fieldcal.logs.encodings.ros2_definitions import short_name
+from fieldcal.logs.encodings.ros2_cdr import CdrDecoder, Ros1Decoder
 from fieldcal.logs.interface import LogSummary
+from fieldcal.logs.joining import INERTIAL
 from fieldcal.logs.mcap.records import Channel, Schema
 from fieldcal.logs.mcap.report import Definitions
+from fieldcal.logs.mcap.topics import imu_halves, is_estimate, tell_of_references, type_name_of
 from fieldcal.reason_codes import ReasonCode
 
 RAW_IMU = "fieldcal_msgs/RawImu"
@@ -60,6 +61,10 @@ KNOWN_TYPES: Mapping[str, Mapping[str, Mapping[str, Want]]] = {
 """Role -> message type -> its fields; among types, the first is preferred."""
 
 SI_TYPES = ("sensor_msgs/Imu", "sensor_msgs/MagneticField")
+FEW_SHARE = 0.01
+"""Topics with fewer than this share of the messages of the busiest one that could play a role are commands."""
+OPTIONAL = ("magnetometer", "temperature", "power", "position", "vps")
+"""Roles that a flight may lack although they are configured."""
 _HINTS = {"imu": ("raw",), "magnetometer": ("raw",), "vps": ("vps", "mocap", "vrpn", "optitrack", "vicon")}
 
 
@@ -74,7 +79,13 @@ class Source:
     values: tuple[str, ...]
 
 
-def choose_sources(definitions: Definitions, mapping: McapMap, summary: LogSummary, log_name: str) -> list[Source]:
+def choose_sources(
+    definitions: Definitions,
+    mapping: McapMap,
+    summary: LogSummary,
+    log_name: str,
+    counts: Mapping[int, int] | None = None,
+) -> list[Source]:
     """The sources of every role that the file can fill.
 
     Parameters
@@ -87,22 +98,35 @@ def choose_sources(definitions: Definitions, mapping: McapMap, summary: LogSumma
         Receives findings.
     log_name : str
         For sentences.
+    counts : mapping, optional
+        Channel id → messages, where the file says.
 
     Raises
     ------
     UnreadableLog
-        `missing_topic`, `missing_field`, `unsupported_schema` for what is configured; `missing_sensor` when the file
+        `missing_topic`, `missing_field`, `unsupported_schema` for a configured IMU; `missing_sensor` when the file
         has no inertial or magnetic sensor.
     """
-    sources = []
+    sources: list[Source] = []
     fields = mapping.imu_fields or {}
     for role in KNOWN_TYPES:
         configured = getattr(mapping, role)
-        if configured:
-            sources.append(_configured(role, configured, fields, definitions, log_name))
-        else:
-            source = _by_type(role, fields, definitions, summary, log_name)
+        if not configured and role == "imu" and not fields and (halves := imu_halves(definitions)):
+            sources += [_half(sensor, topic, definitions) for sensor, topic in zip(INERTIAL, halves, strict=True)]
+            continue
+        if not configured:
+            source = _by_type(role, fields, definitions, summary, log_name, counts or {})
             sources += [source] if source else []
+            continue
+        try:
+            sources.append(_configured(role, configured, fields, definitions, log_name))
+        except UnreadableLog as error:
+            if role not in OPTIONAL:
+                raise
+            summary.add(error.reason_code, 1, f"{error.sentence} The log is read without its {role}.")
+    vps = next((source.topic for source in sources if source.role == "vps"), None)
+    if not mapping.vps:
+        tell_of_references(vps, definitions, summary, log_name)
     given = {value for source in sources for value in source.values}
     if not given & {"gyroscope", "accelerometer", "magnetometer"}:
         raise UnreadableLog(
@@ -121,7 +145,7 @@ def _configured(role: str, topic: str, fields: Mapping[str, Paths], definitions:
             f"{log_name} has no topic {topic}, which the configuration gives as mcap.{role}; its topics are "
             f"{_topics(definitions)}. Correct mcap.{role}.",
         )
-    type_name = _type_name(channels[0], definitions)
+    type_name = type_name_of(channels[0], definitions)
     wants = _wants(role, type_name, fields)
     if wants is None:
         raise UnreadableLog(
@@ -146,14 +170,23 @@ def _configured(role: str, topic: str, fields: Mapping[str, Paths], definitions:
 
 
 def _by_type(
-    role: str, fields: Mapping[str, Paths], definitions: Definitions, summary: LogSummary, log_name: str
+    role: str,
+    fields: Mapping[str, Paths],
+    definitions: Definitions,
+    summary: LogSummary,
+    log_name: str,
+    counts: Mapping[int, int],
 ) -> Source | None:
-    """The source of a role that nothing configures: by message type, then hints in the topic's name, then the name."""
+    """The source of a role that nothing configures: by message type, then hints in the topic's name, then the name.
+
+    Topics with hardly any messages, and of poses the vehicle's own estimates, come last.
+    """
     candidates: dict[str, Source] = {}
-    ranks: dict[str, tuple[int, bool, str]] = {}
+    ranks: dict[str, tuple[bool, int, bool, str]] = {}
+    messages: dict[str, int] = {}
     order = [*KNOWN_TYPES[role]]
     for topic, channels in sorted(definitions.by_topic().items()):
-        type_name = _type_name(channels[0], definitions)
+        type_name = type_name_of(channels[0], definitions)
         wants = _wants(role, type_name, fields)
         if wants is None:
             continue
@@ -166,11 +199,14 @@ def _by_type(
                 )
             continue
         hinted = any(hint in topic.lower() for hint in _HINTS.get(role, ()))
-        ranks[topic] = (order.index(type_name) if type_name in order else -1, not hinted, topic)
+        rank = order.index(type_name) if type_name in order else -1
+        messages[topic] = sum(counts.get(channel.channel_id, 0) for channel in channels)
+        ranks[topic] = (role == "vps" and is_estimate(topic), rank, not hinted, topic)
         candidates[topic] = Source(role, topic, type_name, decoders, tuple(wants))
     if not candidates:
         return None
-    chosen = min(candidates, key=lambda topic: ranks[topic])
+    busiest = max(messages.values())
+    chosen = min(candidates, key=lambda topic: (messages[topic] < FEW_SHARE * busiest, *ranks[topic]))
     if len(candidates) > 1:
         summary.add(
             ReasonCode.AMBIGUOUS_TOPIC,
@@ -180,17 +216,20 @@ def _by_type(
     return candidates[chosen]
 
 
+def _half(sensor: str, topic: str, definitions: Definitions) -> Source:
+    """One sensor of an IMU that has a topic for each."""
+    channels = definitions.by_topic()[topic]
+    type_name = type_name_of(channels[0], definitions)
+    wants = {sensor: KNOWN_TYPES["imu"][type_name][sensor]}
+    return Source(sensor, topic, type_name, _decoders(channels, definitions, wants), (sensor,))
+
+
 def _wants(role: str, type_name: str, fields: Mapping[str, Paths]) -> Mapping[str, Want] | None:
     known = KNOWN_TYPES[role].get(type_name)
     custom_allowed = not any(type_name in types for types in KNOWN_TYPES.values()) or type_name == RAW_IMU
     if role == "imu" and fields and custom_allowed:
         return {name: Want.of(path, 1 if name == "temperature" else 3) for name, path in fields.items()}
     return known
-
-
-def _type_name(channel: Channel, definitions: Definitions) -> str:
-    schema = definitions.schemas.get(channel.schema_id)
-    return short_name(schema.name) if schema else ""
 
 
 def _decoders(channels: Sequence[Channel], definitions: Definitions, wants: Mapping[str, Want]) -> dict[int, Decoder]:
@@ -208,6 +247,8 @@ def _decoder(channel: Channel, definitions: Definitions, wants: Mapping[str, Wan
     if channel.message_encoding == "cdr":
         text = schema.data.decode("utf-8", "replace") if schema.encoding == "ros2msg" else ""
         return CdrDecoder(schema.name, text, wants)
+    if channel.message_encoding == "ros1" and schema.encoding == "ros1msg":
+        return Ros1Decoder(schema.name, schema.data.decode("utf-8", "replace"), wants)
     if channel.message_encoding == "json":
         return JsonDecoder(wants)
     if channel.message_encoding == "protobuf" and schema.encoding == "protobuf":
@@ -217,6 +258,6 @@ def _decoder(channel: Channel, definitions: Definitions, wants: Mapping[str, Wan
 
 def _topics(definitions: Definitions) -> str:
     listed = sorted(
-        f"{channel.topic} ({_type_name(channel, definitions)})" for channel in definitions.channels.values()
+        f"{channel.topic} ({type_name_of(channel, definitions)})" for channel in definitions.channels.values()
     )
     return ", ".join(listed[:20]) if listed else "none"

@@ -1,0 +1,63 @@
+"""What the topics of an MCAP file say beyond their types: halves of an IMU, estimates that are no reference."""
+
+from __future__ import annotations
+
+from fieldcal.logs.encodings.ros2_definitions import short_name
+from fieldcal.logs.interface import LogSummary
+from fieldcal.logs.mcap.records import Channel
+from fieldcal.logs.mcap.report import Definitions
+from fieldcal.reason_codes import ReasonCode
+
+IMU = "sensor_msgs/Imu"
+UNREAD_POSES = ("tf2_msgs/TFMessage", "tf/tfMessage")
+"""Types that hold poses of many frames in one topic."""
+ESTIMATES = ("local_position", "global_position", "ekf", "estimat", "filtered", "fused", "robot_pose", "localization")
+"""What stands in the names of topics that carry an autopilot's own estimate: it has seen the IMU already."""
+
+
+def tell_of_references(vps: str | None, definitions: Definitions, summary: LogSummary, log_name: str) -> None:
+    """Findings on a VPS that nothing configures: its topic `vps` carries an estimate of the vehicle's own, or there is
+    none and transforms are not read."""
+    if vps is not None and is_estimate(vps):
+        summary.add(
+            ReasonCode.VPS_IS_ESTIMATE,
+            1,
+            f"{log_name}: {vps} is taken for the VPS, but looks like the vehicle's own estimate, which has seen the "
+            "IMU already: agreement with it proves nothing. Name the topic of a reference as mcap.vps.",
+        )
+    unread = [
+        f"{topic} ({type_name_of(channels[0], definitions)})"
+        for topic, channels in sorted(definitions.by_topic().items())
+        if type_name_of(channels[0], definitions) in UNREAD_POSES
+    ]
+    if vps is None and unread:
+        summary.add(
+            ReasonCode.UNSUPPORTED_SCHEMA,
+            len(unread),
+            f"{log_name}: there is no VPS; transforms of {', '.join(unread)} are not read. Publish the vehicle's pose "
+            "as geometry_msgs/PoseStamped if it is among them.",
+        )
+
+
+def is_estimate(topic: str) -> bool:
+    """Whether a topic's name is that of an autopilot's own estimate."""
+    return any(word in topic.lower() for word in ESTIMATES)
+
+
+def imu_halves(definitions: Definitions) -> tuple[str, str] | None:
+    """Topics of gyroscope and accelerometer where these two, so named, are the only ones of type sensor_msgs/Imu.
+
+    Drivers of cameras publish each sensor in a message of an IMU whose other half is zero.
+    """
+    topics = [t for t, channels in definitions.by_topic().items() if type_name_of(channels[0], definitions) == IMU]
+    gyroscopes = [topic for topic in topics if "gyro" in topic.lower() and "acc" not in topic.lower()]
+    accelerometers = [topic for topic in topics if "acc" in topic.lower() and "gyro" not in topic.lower()]
+    if len(topics) == 2 and len(gyroscopes) == len(accelerometers) == 1:
+        return gyroscopes[0], accelerometers[0]
+    return None
+
+
+def type_name_of(channel: Channel, definitions: Definitions) -> str:
+    """Message type of a channel in its short form, empty where it has no schema."""
+    schema = definitions.schemas.get(channel.schema_id)
+    return short_name(schema.name) if schema else ""
