@@ -27,12 +27,13 @@ from fieldcal.logs.interface import (
     LogSummary,
 )
 from fieldcal.logs.mcap.reader import McapLog
+from fieldcal.logs.ulog.reader import UlogLog
 from fieldcal.reason_codes import ReasonCode
 
-READERS: dict[str, Callable[[Path, Vehicle], LogReader]] = {"mcap": McapLog, "csv": CsvLog}
+READERS: dict[str, Callable[[Path, Vehicle], LogReader]] = {"mcap": McapLog, "csv": CsvLog, "ulog": UlogLog}
 """Log format (as `discovery.log_format` names it) -> reader."""
 
-_NOT_YET = {"ulog": "PX4 ULog", "dataflash": "ArduPilot DataFlash"}
+_NOT_YET = {"dataflash": "ArduPilot DataFlash"}
 
 
 def open_log(path: Path, vehicle: Vehicle) -> LogReader:
@@ -41,7 +42,7 @@ def open_log(path: Path, vehicle: Vehicle) -> LogReader:
     Parameters
     ----------
     path : Path
-        An `.mcap` or `.csv` file, or a folder with `imu.csv`.
+        An `.mcap`, `.ulg` or `.csv` file, or a folder with `imu.csv`.
     vehicle : Vehicle
         Configuration of its vehicle: topics, columns, units.
 
@@ -97,6 +98,7 @@ __all__ = [
     "LogReader",
     "LogSummary",
     "McapLog",
+    "UlogLog",
     "batch_frame",
     "find_logs",
     "flight_id",

@@ -21,12 +21,13 @@ class Joined:
     """Gyroscope and accelerometer as rows at the gyroscope's stamps.
 
     `columns`: those of table "imu". `interpolated`: rows whose accelerometer lies between two of its readings.
-    `left_out`: gyroscope readings without an accelerometer around them.
+    `left_out`: gyroscope readings in a pause of the accelerometer. `outside`: those before its first or after its last.
     """
 
     columns: Columns
-    interpolated: int
-    left_out: int
+    interpolated: int = 0
+    left_out: int = 0
+    outside: int = 0
 
 
 def join_on_gyroscope(
@@ -49,7 +50,7 @@ def join_on_gyroscope(
     """
     stamps, first = np.unique(accelerometer_ns, return_index=True)  # of a stamp that repeats, its first reading
     if not len(stamps) or not len(gyroscope_ns):
-        return Joined(imu_columns(gyroscope_ns[:0], gyroscope[:0], accelerometer[:0]), 0, len(gyroscope_ns))
+        return Joined(imu_columns(gyroscope_ns[:0], gyroscope[:0], accelerometer[:0]), outside=len(gyroscope_ns))
     values = accelerometer[first]
     after = np.searchsorted(stamps, gyroscope_ns)
     exact = stamps[np.minimum(after, len(stamps) - 1)] == gyroscope_ns
@@ -66,7 +67,8 @@ def join_on_gyroscope(
     return Joined(
         imu_columns(gyroscope_ns[kept], gyroscope[kept], between),
         int(np.count_nonzero(kept & ~exact)),
-        int(np.count_nonzero(~kept)),
+        int(np.count_nonzero(inside & ~kept)),
+        int(np.count_nonzero(~inside)),
     )
 
 
@@ -80,23 +82,24 @@ def triad(sensor: str, values: NDArray[np.float64]) -> Columns:
     return {f"{sensor}_{axis}": np.ascontiguousarray(values[:, i], np.float64) for i, axis in enumerate("xyz")}
 
 
-def tell_join(summary: LogSummary, log_name: str, stream: str, joined: Joined) -> None:
-    """Findings on rows that were joined from two streams."""
-    rows = len(joined.columns["t_ns"])
-    if joined.interpolated:
+def tell_join(
+    summary: LogSummary, log_name: str, stream: str, *, interpolated: int, left_out: int, outside: int
+) -> None:
+    """Findings on rows that were joined from two streams; numbers as `Joined` has them."""
+    if interpolated:
         summary.add(
             ReasonCode.INTERPOLATED,
-            joined.interpolated,
-            f"{log_name}: {stream} logs gyroscope and accelerometer at different times; in {joined.interpolated} of "
-            f"{rows} rows the accelerometer is interpolated to the gyroscope's time.",
+            interpolated,
+            f"{log_name}: {stream} has gyroscope and accelerometer at different times; in {interpolated} rows the "
+            "accelerometer is interpolated to the gyroscope's time.",
         )
-    if joined.left_out:
+    if left_out or outside:
         summary.add(
             ReasonCode.INCOMPLETE_ROW,
-            joined.left_out,
-            f"{log_name}: {joined.left_out} gyroscope readings of {stream} have no accelerometer reading around them "
-            "and were left out.",
-            loses_data=True,
+            left_out + outside,
+            f"{log_name}: {left_out + outside} gyroscope readings of {stream} have no accelerometer reading around "
+            f"them ({outside} of them before its first or after its last) and were left out.",
+            loses_data=left_out > 0,
         )
 
 

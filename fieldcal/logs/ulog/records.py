@@ -146,7 +146,7 @@ def row_kind(name: str, formats: Mapping[str, tuple[Field, ...]], depth: int = 0
     if name not in formats or depth > MOST_NESTED:
         raise ValueError(f"format {name} is not defined")
     names: list[str] = []
-    kinds: list[np.dtype] = []  # type: ignore[type-arg]  # of any type that ULog has
+    kinds: list[np.dtype] = []
     fields = list(formats[name])
     padding = 0
     while depth == 0 and fields and fields[-1].name.startswith("_padding"):
@@ -156,7 +156,7 @@ def row_kind(name: str, formats: Mapping[str, tuple[Field, ...]], depth: int = 0
         if not 0 < count <= MOST_ELEMENTS or field.name in names:
             raise ValueError(f"format {name} has an impossible field {field.name}")
         if field.type_name == "char" and field.count is not None:
-            kind: np.dtype = np.dtype(f"S{count}")  # type: ignore[type-arg]
+            kind: np.dtype = np.dtype(f"S{count}")
         else:
             basic = BASIC_TYPES.get(field.type_name)
             kind = np.dtype(basic) if basic else row_kind(field.type_name, formats, depth + 1)[0]
