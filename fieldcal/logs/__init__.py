@@ -74,10 +74,11 @@ def read_log(path: Path, vehicle: Vehicle) -> tuple[dict[str, pl.DataFrame], Log
 
 
 def batch_frame(table: str, columns: Columns) -> pl.DataFrame:
-    """A batch as a frame with every column of its signal table; those the log lacks are null."""
+    """A batch as a frame with every column of its signal table; those the log lacks are null. Tables of further units,
+    "imu.1", have the columns of their kind."""
     rows = len(columns["t_ns"])
     series = []
-    for name in SIGNAL_COLUMNS[table]:
+    for name in SIGNAL_COLUMNS[table.partition(".")[0]]:
         dtype = pl.Int64 if name == "t_ns" else pl.Float64
         if name in columns:
             series.append(pl.Series(name, np.ascontiguousarray(columns[name]), dtype))

@@ -131,12 +131,14 @@ def tell_sources(summary: LogSummary, log_name: str, advice: str) -> None:
     `advice`: a sentence, what to log instead for raw readings.
     """
     corrected = [source for source in summary.sources if source.primary and source.corrected]
+    unknown = " The log does not tell which of its units they are of, and so which parameters held."
     if corrected:
+        told = "" if all(one.parameters for source in corrected for one in source.corrections) else unknown
         summary.add(
             ReasonCode.ALREADY_CORRECTED,
             1,
             f"{log_name}: {_listed(corrected)} had been corrected by the autopilot by its parameters; constants found "
-            f"here are what remains, and come on top of those. {advice}",
+            f"here are what remains, and come on top of those.{told} {advice}",
         )
     further = [source for source in summary.sources if not source.primary]
     if further:

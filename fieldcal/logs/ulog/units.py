@@ -13,6 +13,9 @@ from fieldcal.logs.ulog.streams import (
     FIFO_ACCELEROMETER,
     FIFO_GYROSCOPE,
     LATEST_US,
+    ROWS_FOR_A_RATE,
+    Clock,
+    combined_magnetometer,
     has,
     rate_hz,
     stamps_us,
@@ -133,7 +136,7 @@ def magnetometers(file: UlogFile, parameters: Mapping[str, float]) -> list[Unit]
         streams.setdefault(key, []).append(Stream(topic, rate_hz(file, topic)))
     held = [topic for topic in _instances(file, "sensor_combined", "timestamp") if _holds_magnetometer(topic)][:1]
     if held and not streams:
-        streams[0] = [Stream(held[0], rate_hz(file, held[0]))]
+        streams[0] = [Stream(held[0], _held_rate_hz(file, held[0]))]
     if not streams:
         return []
     first = next(iter(streams))
@@ -217,6 +220,13 @@ def _is_combined(topic: Topic) -> bool:
 
 def _holds_magnetometer(topic: Topic) -> bool:
     return has(topic, "magnetometer_ga", shape=_TRIPLE) and has(topic, "magnetometer_timestamp_relative")
+
+
+def _held_rate_hz(file: UlogFile, topic: Topic) -> float:
+    """Rate of a magnetometer whose readings are repeated until the next one."""
+    rows = file.rows(topic, 0, ROWS_FOR_A_RATE)
+    t_ns = combined_magnetometer(rows, Clock(), -1)[0]
+    return float(1e9 / np.median(np.diff(t_ns))) if len(t_ns) > 1 and np.median(np.diff(t_ns)) > 0 else 0.0
 
 
 def _is_averaged(topic: Topic) -> bool:
