@@ -49,7 +49,7 @@ class Damaged:
 class Judged:
     """What became of one case. `altered`: rows that the undamaged file does not have. `undetectable`: at most so many
     could not be detected. `excess`: rows that were lost beyond what the damage had to cost. `untold`: rows are missing
-    without a word."""
+    without a word, where that could be detected."""
 
     altered: int
     undetectable: int
@@ -171,15 +171,10 @@ def judge(parts: list[bytes], damaged: Damaged, sound: collections.Counter[tuple
     hit = (starts[:-1] < max(high, low + 1)) & (ends > low)
     in_definitions = bool((hit & ~data).any())
     excess = 0 if in_definitions else missing - int(np.count_nonzero(hit & data)) - EDGES
+    possible = undetectable(parts, damaged)
     told = bool(log.losses.places or log.losses.cut_bytes or log.unknown_messages)
-    return Judged(
-        altered,
-        undetectable(parts, damaged),
-        excess,
-        missing > 0 and not told and not of_whole_messages(parts, damaged),
-        False,
-        seconds,
-    )
+    untold = missing > 0 and not told and not possible and not of_whole_messages(parts, damaged)
+    return Judged(altered, possible, excess, untold, False, seconds)
 
 
 def case(parts: list[bytes], seed: int) -> Damaged:

@@ -159,7 +159,7 @@ def tell_simulated(summary: LogSummary, log_name: str, why: str, *, expected: bo
         1,
         f"{log_name} is of a simulation ({why}): its sensors are not real. "
         + (
-            "Its vehicle is configured as simulated."
+            "It is read as one."
             if expected
             else "Nothing of it is published as a flight; if the vehicle is a simulated one, set simulated = true in "
             "its table of fieldcal.toml."
