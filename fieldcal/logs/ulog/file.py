@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.mcap.mapped import map_file
 from fieldcal.logs.ulog import records
-from fieldcal.logs.ulog.records import FILE_HEAD_BYTES, HEAD_BYTES, MESSAGE_ID_BYTES, Field, Topic
+from fieldcal.logs.ulog.records import FILE_HEAD_BYTES, HEAD_BYTES, MESSAGE_ID_BYTES, Topic
 from fieldcal.logs.ulog.scan import IDS, Found, Losses, Scan, Sizes
 from fieldcal.reason_codes import ReasonCode
 
@@ -84,7 +84,7 @@ class UlogFile:
         self.unknown_messages = 0
         self.losses = Losses()
         self._wanted = wanted
-        self._formats: dict[str, tuple[Field, ...]] = {}
+        self._formats: dict[str, str] = {}
         self._sizes = Sizes()
         self._is_wanted = np.zeros(IDS, bool)
         self._stamp_at = np.full(IDS, -1, np.int64)
@@ -211,7 +211,7 @@ class UlogFile:
         return int(struct.unpack_from("<Q", found.payload(index), place)[0])
 
 
-def _topic(payload: bytes, formats: dict[str, tuple[Field, ...]]) -> Topic | None:
+def _topic(payload: bytes, formats: dict[str, str]) -> Topic | None:
     name = payload[3:].decode("ascii")
     try:
         kind, padding = records.row_kind(name, formats)

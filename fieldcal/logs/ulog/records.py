@@ -105,13 +105,16 @@ def fits(kind: int, payload: bytes) -> bool:
     return kind == FLAGS and len(payload) >= FLAG_BITS_BYTES
 
 
-def read_format(payload: bytes) -> tuple[str, tuple[Field, ...]]:
-    """Name and fields of a format that `fits`."""
+def read_format(payload: bytes) -> tuple[str, str]:
+    """Name of a format that `fits`, and its fields as text: most of a file's formats are not asked for."""
     name, _, fields = payload.decode("ascii").partition(":")
-    found = (_FIELD.fullmatch(text) for text in fields.split(";") if text)
-    return name, tuple(
-        Field(match[3], match[1], None if match[2] is None else int(match[2])) for match in found if match
-    )
+    return name, fields
+
+
+def fields_of(text: str) -> list[Field]:
+    """The fields in a format's text."""
+    found = (_FIELD.fullmatch(own) for own in text.split(";") if own)
+    return [Field(match[3], match[1], None if match[2] is None else int(match[2])) for match in found if match]
 
 
 def read_keyed(payload: bytes, before: int = 0) -> tuple[str, str, bytes]:
@@ -138,7 +141,7 @@ def text_of(type_name: str, value: bytes) -> str:
     return " ".join(str(number) for number in np.frombuffer(value, kind).tolist())
 
 
-def row_kind(name: str, formats: Mapping[str, tuple[Field, ...]], depth: int = 0) -> tuple[np.dtype[np.void], int]:
+def row_kind(name: str, formats: Mapping[str, str], depth: int = 0) -> tuple[np.dtype[np.void], int]:
     """The structured type of a topic's rows without its trailing padding, and how many bytes that padding has.
 
     Raises ValueError where a nested format is missing, or sizes are none that a logger writes.
@@ -147,7 +150,7 @@ def row_kind(name: str, formats: Mapping[str, tuple[Field, ...]], depth: int = 0
         raise ValueError(f"format {name} is not defined")
     names: list[str] = []
     kinds: list[np.dtype] = []
-    fields = list(formats[name])
+    fields = fields_of(formats[name])
     padding = 0
     while depth == 0 and fields and fields[-1].name.startswith("_padding"):
         padding += fields.pop().count or 1
