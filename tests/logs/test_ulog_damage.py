@@ -13,7 +13,7 @@ from ulog_support import flight, parts_of
 from fieldcal.config.configuration import load
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs import ingest, read_log
-from fieldcal.logs.ulog import records
+from fieldcal.logs.ulog import records, scan
 from fieldcal.logs.ulog.file import UlogFile
 from fieldcal.logs.ulog.write import message
 
@@ -34,6 +34,35 @@ def test_a_damaged_file_gives_rows_of_the_undamaged_one_only(tmp_path: Path, fir
         assert judged.excess <= 0, seed
         assert not judged.untold, seed
         assert judged.seconds < MOST_CASE_S, seed
+
+
+def test_damage_at_a_blocks_border_is_seen_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = ulog_damage.small_log()
+    path = tmp_path / "f.ulg"
+    path.write_bytes(b"".join(parts))
+    monkeypatch.setattr(scan, "BLOCK_BYTES", 400)
+    monkeypatch.setattr(scan, "FIRST_MESSAGES", 2)
+    sound, log = ulog_damage.rows_of(path)
+    assert sum(sound.values()) == sum(part[2] == records.DATA for part in parts[1:])
+    assert log.losses == scan.Losses()
+    for seed in range(1, 41):
+        judged = ulog_damage.judge(parts, ulog_damage.case(parts, seed), sound, path)
+        assert judged.altered <= judged.undetectable, seed
+        assert not judged.untold, seed
+
+
+def test_what_looks_like_two_messages_in_damaged_bytes_is_none(tmp_path: Path) -> None:
+    parts = parts_of(flight())
+    half = len(parts) // 2
+    of_imu = next(part for part in parts[half:] if part[2:5] == bytes([records.DATA, 0, 0]))
+    looks = of_imu[:-8] + b"\x55" * 8
+    content = b"".join(parts[:half]) + b"\xff" * 50 + looks + looks + b"\xff" * 50 + b"".join(parts[half:])
+    path = tmp_path / "f.ulg"
+    path.write_bytes(content)
+    log = UlogFile(path)
+    (topic,) = log.instances("sensor_combined")
+    assert looks[5:] not in {row.tobytes() for row in log.rows(topic)}
+    assert log.losses.places == 1
 
 
 def test_the_judge_would_see_an_altered_row(tmp_path: Path) -> None:

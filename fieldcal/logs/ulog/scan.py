@@ -112,13 +112,16 @@ class Scan:
             more = position + len(block) < end or (len(starts) == most and not whole)
             found = self._found(block, position, starts)
             count, proof = self._judge(found)
-            if count == len(starts) and (whole or (more and stop)):
-                keep = count if whole else self._carried(found, proof, count)
+            keep = count if whole else self._carried(found, proof, count)
+            if count == len(starts) == most and not whole and not keep:
+                most *= 4
+                continue
+            if count == len(starts) and keep and (whole or (more and stop)):
                 yield _first(found, keep)
                 position = end if whole else position + (int(starts[keep]) if keep < count else stop)
                 most = min(4 * most, ALL_MESSAGES)
                 continue
-            if count == len(starts) and self._begins_data(block, stop):  # the end was cut within a data message
+            if count == len(starts) and not more and self._begins_data(block, stop):  # the end was cut within it
                 yield found
                 self._losses.cut_bytes += len(block) - stop
                 return
@@ -173,9 +176,11 @@ class Scan:
         return count, proof | (known & right)
 
     def _carried(self, found: Found, proof: NDArray[np.bool_], count: int) -> int:
-        """Of a block that goes on: how many count now. The last proof is looked at once more with what follows."""
+        """Of a block that goes on: how many count now. The last proof is looked at once more with what follows; a data
+        message that none follows does not count."""
         proofs = np.flatnonzero(proof[1:count])
-        return int(proofs[-1]) + 1 if len(proofs) else count
+        unproven = count > 0 and bool(proof[0]) and found.kinds[0] == records.DATA
+        return int(proofs[-1]) + 1 if len(proofs) else 0 if unproven else count
 
     def _trusted(self, found: Found, proof: NDArray[np.bool_], count: int) -> int:
         """Of a block in which message `count` does not fit: how many before it count.
