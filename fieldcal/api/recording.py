@@ -163,7 +163,7 @@ def read_log(path: Path | str, *, config: Path | str | None = None, vehicle: str
     Parameters
     ----------
     path : Path or str
-        An MCAP or CSV file, or a folder with imu.csv; its vehicle and session are the folders it lies in,
+        An MCAP, ULog or CSV file, or a folder with imu.csv; its vehicle and session are the folders it lies in,
         ``<vehicle>/<session>/<log>``.
     config : Path or str, optional
         A fieldcal.toml: topics, columns, units. Otherwise the one in the folder above the vehicle's, if there is one.

@@ -67,7 +67,7 @@ def apply(
     Parameters
     ----------
     log
-        An MCAP or CSV file, or a folder with imu.csv.
+        An MCAP, ULog or CSV file, or a folder with imu.csv.
     output
         NAME.mcap: ROS 2 Imu and MagneticField in body axes (REP-103). Anything else: a folder for imu.parquet and
         magnetometer.parquet, in the sensor axes as logged.

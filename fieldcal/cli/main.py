@@ -76,7 +76,7 @@ def calibrate(
     Parameters
     ----------
     log
-        An MCAP or CSV file, or a folder with imu.csv.
+        An MCAP, ULog or CSV file, or a folder with imu.csv.
     vehicle
         The vehicle in fieldcal.toml; else the folder two levels above the log.
     method

@@ -23,7 +23,7 @@ def simulate(
     /,
     *,
     seed: int = 0,
-    log_format: Annotated[Literal["mcap", "csv"], Parameter(name="--format")] = "mcap",
+    log_format: Annotated[Literal["mcap", "csv", "ulog"], Parameter(name="--format")] = "mcap",
     vehicles: int = 1,
     sessions: int = 1,
     flights: int = 1,
@@ -58,7 +58,7 @@ def simulate(
     seed
         Equal seeds give equal logs.
     log_format
-        One MCAP file a flight, or a folder of CSVs.
+        One MCAP file a flight, a folder of CSVs, or one ULog file.
     vehicles, sessions, flights
         How many vehicles, sessions of each, flights in each.
     duration

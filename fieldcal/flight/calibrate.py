@@ -88,8 +88,12 @@ def overruled(
 
 
 def read(job: Job, vehicle: Vehicle) -> LogRead:
-    """A whole log in memory; what cannot be read has verdict `rejected` and no signals."""
-    return LogRead(job, vehicle, *ingest.read_flight(Path(job.path), vehicle))
+    """A whole log in memory; what cannot be read has verdict `rejected` and no signals.
+
+    Nothing of it enters a history, so that a simulation is as welcome as a flight; that it is one is told.
+    """
+    reading = vehicle.model_copy(update={"simulated": True})
+    return LogRead(job, vehicle, *ingest.read_flight(Path(job.path), reading))
 
 
 def run_stages(log: LogRead) -> CalibratedLog:

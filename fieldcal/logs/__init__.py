@@ -27,12 +27,13 @@ from fieldcal.logs.interface import (
     LogSummary,
 )
 from fieldcal.logs.mcap.reader import McapLog
+from fieldcal.logs.ulog.reader import UlogLog
 from fieldcal.reason_codes import ReasonCode
 
-READERS: dict[str, Callable[[Path, Vehicle], LogReader]] = {"mcap": McapLog, "csv": CsvLog}
+READERS: dict[str, Callable[[Path, Vehicle], LogReader]] = {"mcap": McapLog, "csv": CsvLog, "ulog": UlogLog}
 """Log format (as `discovery.log_format` names it) -> reader."""
 
-_NOT_YET = {"ulog": "PX4 ULog", "dataflash": "ArduPilot DataFlash"}
+_NOT_YET = {"dataflash": "ArduPilot DataFlash"}
 
 
 def open_log(path: Path, vehicle: Vehicle) -> LogReader:
@@ -41,7 +42,7 @@ def open_log(path: Path, vehicle: Vehicle) -> LogReader:
     Parameters
     ----------
     path : Path
-        An `.mcap` or `.csv` file, or a folder with `imu.csv`.
+        An `.mcap`, `.ulg` or `.csv` file, or a folder with `imu.csv`.
     vehicle : Vehicle
         Configuration of its vehicle: topics, columns, units.
 
@@ -73,10 +74,11 @@ def read_log(path: Path, vehicle: Vehicle) -> tuple[dict[str, pl.DataFrame], Log
 
 
 def batch_frame(table: str, columns: Columns) -> pl.DataFrame:
-    """A batch as a frame with every column of its signal table; those the log lacks are null."""
+    """A batch as a frame with every column of its signal table; those the log lacks are null. Tables of further units,
+    "imu.1", have the columns of their kind."""
     rows = len(columns["t_ns"])
     series = []
-    for name in SIGNAL_COLUMNS[table]:
+    for name in SIGNAL_COLUMNS[table.partition(".")[0]]:
         dtype = pl.Int64 if name == "t_ns" else pl.Float64
         if name in columns:
             series.append(pl.Series(name, np.ascontiguousarray(columns[name]), dtype))
@@ -97,6 +99,7 @@ __all__ = [
     "LogReader",
     "LogSummary",
     "McapLog",
+    "UlogLog",
     "batch_frame",
     "find_logs",
     "flight_id",

@@ -15,6 +15,7 @@ import polars as pl
 from fieldcal.config.configuration import parse
 from fieldcal.config.flight_settings import FlightSettings, flight_settings
 from fieldcal.logs.mcap.write import pose_channel, raw_imu_channel, write_mcap
+from fieldcal.logs.ulog.write import Rows, write_ulog
 from fieldcal.names import SENSORS, Sensor
 from fieldcal.simulation.experiment import Experiment, SimulatedFlight, constants_at, simulate
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, triad
@@ -47,8 +48,8 @@ def write_flights(
         What is flown; default: the paper's.
     vehicles, sessions, flights : int
         How many vehicles, sessions of each, flights in each.
-    log_format : {"mcap", "csv"}
-        One MCAP file, or a folder with imu.csv and vps.csv.
+    log_format : {"mcap", "csv", "ulog"}
+        One MCAP file, a folder with imu.csv and vps.csv, or one ULog file with PX4's raw topics.
 
     Examples
     --------
@@ -59,8 +60,8 @@ def write_flights(
     >>> [log.name for log in logs]
     ['flight-01.mcap', 'flight-02.mcap']
     """
-    if log_format not in ("mcap", "csv"):
-        raise ValueError(f'log_format is "mcap" or "csv", not {log_format!r}')
+    if log_format not in ("mcap", "csv", "ulog"):
+        raise ValueError(f'log_format is "mcap", "csv" or "ulog", not {log_format!r}')
     base, folder = experiment or Experiment(), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     logs = []
@@ -125,6 +126,9 @@ def write_flight(folder: Path, name: str, r: SimulatedFlight, start: datetime, *
     if log_format == "mcap":
         log = folder / f"{name}.mcap"
         _write_mcap(log, r, t_ns, vps_ns, start_ns)
+    elif log_format == "ulog":
+        log = folder / f"{name}.ulg"
+        _write_ulog(log, r, start_ns)
     else:
         log = folder / name
         log.mkdir(exist_ok=True)
@@ -132,7 +136,7 @@ def write_flight(folder: Path, name: str, r: SimulatedFlight, start: datetime, *
     (folder / f"{name}.truth.json").write_text(json.dumps(truth(r), indent=1) + "\n", encoding="utf-8")
     pl.DataFrame(
         {
-            "t_ns": t_ns if log_format == "mcap" else np.rint(r.t * 1e9).astype(np.int64),
+            "t_ns": np.rint(r.t * 1e9).astype(np.int64) if log_format == "csv" else t_ns,
             **columns_of(r.q, QUATERNION),
             **columns_of(r.rate, [f"rate_{a}_radps" for a in AXES]),
         }
@@ -189,6 +193,27 @@ def _write_mcap(path: Path, r: SimulatedFlight, t_ns: np.ndarray, vps_ns: np.nda
         channels.append(pose_channel(vps_ns, seen_ns, r.vps_q, r.vps_position))
     units = {f"unit_{name}": "counts" for name in SENSORS}
     write_mcap(path, channels, metadata={**units, "world": "ned", "body": "frd", "gravity_sign": "gravity"})
+
+
+def _write_ulog(path: Path, r: SimulatedFlight, start_ns: int) -> None:
+    """Raw counts in the topics of PX4's drivers, and VPS poses as motion capture; the clock starts at the boot."""
+    t_us = np.rint(r.t * 1e6).astype(np.uint64)
+    ids = {"sensor_gyro": Sensor.GYROSCOPE, "sensor_accel": Sensor.ACCELEROMETER, "sensor_mag": Sensor.MAGNETOMETER}
+    topics = []
+    for number, (topic, sensor) in enumerate(ids.items()):
+        axes = {axis: r.counts[sensor][:, i].astype(np.float32) for i, axis in enumerate(AXES)}
+        own = {"device_id": np.full(len(t_us), 1000 + number, np.uint32)}
+        warmth = {"temperature": r.temperature.astype(np.float32)}
+        topics.append(Rows(topic, {"timestamp": t_us, "timestamp_sample": t_us, **own, **axes, **warmth}))
+    if len(r.vps_t):
+        vps_us = np.rint(r.vps_t * 1e6).astype(np.uint64)
+        scalar_first = r.vps_q[:, [3, 0, 1, 2]].astype(np.float32)
+        pose = {"position": r.vps_position.astype(np.float32), "q": scalar_first}
+        frame = {"pose_frame": np.ones(len(vps_us), np.uint8)}
+        topics.append(
+            Rows("vehicle_mocap_odometry", {"timestamp": vps_us, "timestamp_sample": vps_us, **pose, **frame})
+        )
+    write_ulog(path, topics, infos={"sys_name": "PX4", "boot_time_utc_us": start_ns // 1000})
 
 
 def _write_csv(folder: Path, r: SimulatedFlight) -> None:

@@ -43,6 +43,7 @@ def test_a_reader_reads_nothing_that_its_key_does_not_hold(tmp_path: Path, log_f
         ("csv = { separator = ';' }", True),
         ("mcap = { imu = '/imu' }", True),
         ("units = { gyroscope = 'deg/s' }", True),
+        ("simulated = true", True),
         ("polarity = { gyroscope = [1, 1, -1] }", False),
         ("parameters = { smoothing_cutoff_hz = 7.0 }", False),
         ("field = { north_east_down = [1.0, 0.0, 0.0], unit = 'norm' }", False),

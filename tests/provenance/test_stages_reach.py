@@ -125,7 +125,7 @@ def test_all_that_a_stage_is_seen_to_run_is_reached(changes: dict[str, Any]) -> 
         tables |= {f"{stage.name}.{name}": frame for name, frame in result.tables.items()}
 
 
-@pytest.mark.parametrize("log_format", ["mcap", "csv"])
+@pytest.mark.parametrize("log_format", ["mcap", "csv", "ulog"])
 def test_all_that_ingest_is_seen_to_run_is_reached(tmp_path: Path, log_format: str) -> None:
     write_flights(tmp_path, Experiment(seed=1, duration_s=10.0), log_format=log_format)
     (log,) = find_logs(tmp_path)

@@ -380,4 +380,4 @@ def test_the_archives_configuration_is_that_of_the_simulated_vehicle(tmp_path: P
 
 def test_unknown_format_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="mcap"):
-        write_flights(tmp_path, log_format="ulg")
+        write_flights(tmp_path, log_format="bag")
