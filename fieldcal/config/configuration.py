@@ -127,6 +127,9 @@ class VehicleTable(Table):
     units: Annotated[Units, _meaning("units of the logged readings")] = {}
     nominal_scale: Annotated[PerSensor[PositiveTriple], _meaning("scale of the data sheet, one or three numbers")] = {}
     reference_reading: Annotated[PerSensor[Triple], _meaning("reading at which zero_bias is told")] = {}
+    simulated: Annotated[
+        bool, _meaning("the vehicle is a simulation; else logs of simulated sensors are set aside")
+    ] = False
     csv: CsvMap = CsvMap()
     mcap: McapMap = McapMap()
     parameters: Parameters = Parameters()

@@ -8,7 +8,7 @@ from fieldcal.names import Json
 
 MAPS = tuple(n for n, key in VehicleTable.model_fields.items() if isinstance(key.default, Table) and n != "parameters")
 """Tables of a vehicle, one a log format that needs one; `parameters` are the stages'."""
-READ = (*MAPS, "units")
+READ = (*MAPS, "units", "simulated")
 
 
 def reader_settings(vehicle: Vehicle) -> dict[str, Json]:

@@ -1,0 +1,170 @@
+"""What logs of autopilots have in common: several units on board, gyroscope and accelerometer logged apart, readings
+that were corrected before they were logged, simulations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldcal.logs.interface import Columns, LogSummary, SensorSource
+from fieldcal.reason_codes import ReasonCode
+
+MOST_INTERVALS_APART = 2.5
+"""An accelerometer's reading is interpolated between two that are at most so many of its usual intervals apart."""
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Gyroscope and accelerometer as rows at the gyroscope's stamps.
+
+    `columns`: those of table "imu". `interpolated`: rows whose accelerometer lies between two of its readings.
+    `left_out`: gyroscope readings without an accelerometer around them.
+    """
+
+    columns: Columns
+    interpolated: int
+    left_out: int
+
+
+def join_on_gyroscope(
+    gyroscope_ns: NDArray[np.int64],
+    gyroscope: NDArray[np.float64],
+    accelerometer_ns: NDArray[np.int64],
+    accelerometer: NDArray[np.float64],
+) -> Joined:
+    """Rows of an IMU whose two sensors are logged apart.
+
+    Where both have one stamp, the readings are as logged. Elsewhere the accelerometer is interpolated linearly, never
+    across a pause of more than `MOST_INTERVALS_APART` usual intervals and never beyond its first and last reading.
+
+    Parameters
+    ----------
+    gyroscope_ns, accelerometer_ns : (n,), (m,) int64
+        Stamps of one clock, in any order.
+    gyroscope, accelerometer : (n, 3), (m, 3)
+        Readings, any unit.
+    """
+    stamps, first = np.unique(accelerometer_ns, return_index=True)  # of a stamp that repeats, its first reading
+    if not len(stamps) or not len(gyroscope_ns):
+        return Joined(imu_columns(gyroscope_ns[:0], gyroscope[:0], accelerometer[:0]), 0, len(gyroscope_ns))
+    values = accelerometer[first]
+    after = np.searchsorted(stamps, gyroscope_ns)
+    exact = stamps[np.minimum(after, len(stamps) - 1)] == gyroscope_ns
+    before = np.where(exact, after, after - 1)
+    inside = (before >= 0) & (after < len(stamps))
+    before, after = np.clip(before, 0, None), np.minimum(after, len(stamps) - 1)
+    apart = stamps[after] - stamps[before]
+    usual = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    kept = inside & (apart <= MOST_INTERVALS_APART * usual)
+    kept |= exact
+    share = np.where(exact, 0.0, (gyroscope_ns - stamps[before]) / np.maximum(apart, 1))[kept, None]
+    low, high = values[before[kept]], values[after[kept]]
+    between = np.where(share == 0.0, low, low + share * (high - low))
+    return Joined(
+        imu_columns(gyroscope_ns[kept], gyroscope[kept], between),
+        int(np.count_nonzero(kept & ~exact)),
+        int(np.count_nonzero(~kept)),
+    )
+
+
+def imu_columns(t_ns: NDArray[np.int64], gyroscope: NDArray[np.float64], accelerometer: NDArray[np.float64]) -> Columns:
+    """Columns of table "imu"."""
+    return {"t_ns": t_ns, **triad("gyroscope", gyroscope), **triad("accelerometer", accelerometer)}
+
+
+def triad(sensor: str, values: NDArray[np.float64]) -> Columns:
+    """The three columns of a sensor from (n, 3) readings."""
+    return {f"{sensor}_{axis}": np.ascontiguousarray(values[:, i], np.float64) for i, axis in enumerate("xyz")}
+
+
+def tell_join(summary: LogSummary, log_name: str, stream: str, joined: Joined) -> None:
+    """Findings on rows that were joined from two streams."""
+    rows = len(joined.columns["t_ns"])
+    if joined.interpolated:
+        summary.add(
+            ReasonCode.INTERPOLATED,
+            joined.interpolated,
+            f"{log_name}: {stream} logs gyroscope and accelerometer at different times; in {joined.interpolated} of "
+            f"{rows} rows the accelerometer is interpolated to the gyroscope's time.",
+        )
+    if joined.left_out:
+        summary.add(
+            ReasonCode.INCOMPLETE_ROW,
+            joined.left_out,
+            f"{log_name}: {joined.left_out} gyroscope readings of {stream} have no accelerometer reading around them "
+            "and were left out.",
+            loses_data=True,
+        )
+
+
+def unit_ids(device_ids: Sequence[int | None], what: str, summary: LogSummary, log_name: str) -> list[str]:
+    """A name for each unit of one kind, in order of their instances: its device id; where the log gives none, or the
+    same to two, the instance.
+
+    `what` names the kind in the finding's sentence ("IMU", "magnetometer").
+    """
+    known = [number for number in device_ids if number]
+    shared = sorted({number for number in known if known.count(number) > 1})
+    if shared:
+        ids = ", ".join(map(str, shared))
+        summary.add(
+            ReasonCode.SHARED_DEVICE_ID,
+            sum(number in shared for number in known),
+            f"{log_name}: several of its {what}s have the device id {ids}; they are told apart by their instance, "
+            "which is another one's after a change of hardware.",
+        )
+    return [
+        str(number) if number and number not in shared else f"instance-{instance}"
+        for instance, number in enumerate(device_ids)
+    ]
+
+
+def tell_sources(summary: LogSummary, log_name: str, advice: str) -> None:
+    """Findings on `summary.sources`: which readings were corrected before they were logged, and further units.
+
+    `advice`: a sentence, what to log instead for raw readings.
+    """
+    corrected = [source for source in summary.sources if source.primary and source.corrected]
+    if corrected:
+        summary.add(
+            ReasonCode.ALREADY_CORRECTED,
+            1,
+            f"{log_name}: {_listed(corrected)} had been corrected by the autopilot by its parameters; constants found "
+            f"here are what remains, and come on top of those. {advice}",
+        )
+    further = [source for source in summary.sources if not source.primary]
+    if further:
+        units = sorted({(source.table, source.unit_id) for source in further})
+        named = ", ".join(f"{table} ({unit_id})" for table, unit_id in units)
+        summary.add(
+            ReasonCode.FURTHER_UNITS,
+            len(units),
+            f"{log_name}: beside the primary units there are {len(units)} more on board, {named}; the primary ones are "
+            "calibrated.",
+        )
+
+
+def tell_simulated(summary: LogSummary, log_name: str, why: str, *, expected: bool) -> None:
+    """Finding on a log without real sensors, as `why` says; fatal unless its vehicle is a simulated one."""
+    summary.add(
+        ReasonCode.SIMULATED,
+        1,
+        f"{log_name} is of a simulation ({why}): its sensors are not real. "
+        + (
+            "Its vehicle is configured as simulated."
+            if expected
+            else "Nothing of it is published as a flight; if the vehicle is a simulated one, set simulated = true in "
+            "its table of fieldcal.toml."
+        ),
+        fatal=not expected,
+    )
+
+
+def _listed(sources: Iterable[SensorSource]) -> str:
+    streams: dict[str, list[str]] = {}
+    for source in sources:
+        streams.setdefault(source.stream, []).append(str(source.sensor))
+    return "; ".join(f"{' and '.join(sensors)} ({stream})" for stream, sensors in streams.items())
