@@ -114,6 +114,8 @@ class ReasonCode(StrEnum):
     """Messages without the layout of their schema."""
     NO_HEADER_STAMP = "no_header_stamp"
     """Messages without a stamp of their own."""
+    NO_GPS_FIX = "no_gps_fix"
+    """GPS messages without a position."""
     UNIT_CONFLICT = "unit_conflict"
     """Log and configuration, or the axes of one sensor, name different units."""
     UNIT_NOT_SUPPORTED = "unit_not_supported"

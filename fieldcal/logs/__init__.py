@@ -15,6 +15,7 @@ import polars as pl
 from fieldcal.config.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.csv.reader import CsvLog
+from fieldcal.logs.dataflash.reader import DataflashLog
 from fieldcal.logs.discovery import find_logs, flight_id, log_format, log_sha256
 from fieldcal.logs.interface import (
     SIGNAL_COLUMNS,
@@ -29,10 +30,14 @@ from fieldcal.logs.interface import (
 from fieldcal.logs.mcap.reader import McapLog
 from fieldcal.reason_codes import ReasonCode
 
-READERS: dict[str, Callable[[Path, Vehicle], LogReader]] = {"mcap": McapLog, "csv": CsvLog}
+READERS: dict[str, Callable[[Path, Vehicle], LogReader]] = {
+    "mcap": McapLog,
+    "csv": CsvLog,
+    "dataflash": DataflashLog,
+}
 """Log format (as `discovery.log_format` names it) -> reader."""
 
-_NOT_YET = {"ulog": "PX4 ULog", "dataflash": "ArduPilot DataFlash"}
+_NOT_YET = {"ulog": "PX4 ULog"}
 
 
 def open_log(path: Path, vehicle: Vehicle) -> LogReader:
@@ -41,7 +46,7 @@ def open_log(path: Path, vehicle: Vehicle) -> LogReader:
     Parameters
     ----------
     path : Path
-        An `.mcap` or `.csv` file, or a folder with `imu.csv`.
+        An `.mcap`, `.csv` or `.bin` (ArduPilot) file, or a folder with `imu.csv`.
     vehicle : Vehicle
         Configuration of its vehicle: topics, columns, units.
 
@@ -92,6 +97,7 @@ __all__ = [
     "Batch",
     "Columns",
     "CsvLog",
+    "DataflashLog",
     "Finding",
     "LogFile",
     "LogReader",
