@@ -103,6 +103,14 @@ class DataflashFile:
                 return Rows(layout, self.content, starts, self._multipliers.get(type_id, {}))
         return None
 
+    def unreadable(self) -> dict[str, int]:
+        """Located messages whose definition contradicts itself, by name."""
+        found: Counter[str] = Counter()
+        for type_id, starts in self._starts.items():
+            if not self.layouts[type_id].columns and len(starts):
+                found[self.layouts[type_id].name] += len(starts)
+        return dict(found)
+
     def counts(self) -> dict[str, int]:
         """Messages by name."""
         named: Counter[str] = Counter()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,15 @@ class Parameters:
             history = self._history.setdefault(name, [])
             if np.isfinite(value) and (not history or history[-1][1] != value):
                 history.append((at_ns, value))
+        for history in self._history.values():
+            history.sort(key=lambda change: change[0])
+
+    @classmethod
+    def of(cls, values: Mapping[str, float]) -> Parameters:
+        """Those that hold all the time."""
+        parameters = cls(None, ())
+        parameters._history = {name: [(0, value)] for name, value in values.items()}
+        return parameters
 
     def __contains__(self, name: str) -> bool:
         return bool(self._history.get(name))
@@ -42,7 +52,7 @@ class Parameters:
         history = self._history.get(name)
         if not history:
             return default
-        return next((value for from_ns, value in reversed(history) if from_ns <= at_ns), history[0][1])
+        return history[max(bisect_right(history, at_ns, key=lambda change: change[0]) - 1, 0)][1]
 
     def triple(self, names: Triad, at_ns: int, default: float = 0.0) -> Triple:
         """The values of three axes that hold at `at_ns`."""

@@ -56,7 +56,7 @@ class DataflashLog:
         self.summary = LogSummary("dataflash", world="ned", body="frd", gravity_sign="specific_force")
         self._file = DataflashFile(path)
         self._file.locate(signals.LOCATED)
-        malformed: dict[str, int] = {}
+        malformed = self._file.unreadable()
         parameters = self._parameters()
         self._imus = units.imus(self._file, parameters, malformed)
         self._magnetometers = units.magnetometers(self._file, parameters, malformed)

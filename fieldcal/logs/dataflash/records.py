@@ -21,10 +21,10 @@ FMT_BYTES = 89
 
 @dataclass(frozen=True)
 class Letter:
-    """How a field of one format letter is stored. `factor`: what the letter itself says of its unit, else None."""
+    """How a field of one format letter is stored. `divisor`: what the letter itself says of its unit, else None."""
 
     dtype: np.dtype[np.generic]
-    factor: float | None = None
+    divisor: float | None = None
 
 
 LETTERS: Mapping[str, Letter] = {
@@ -43,11 +43,11 @@ LETTERS: Mapping[str, Letter] = {
     "n": Letter(np.dtype("S4")),
     "N": Letter(np.dtype("S16")),
     "Z": Letter(np.dtype("S64")),
-    "c": Letter(np.dtype("<i2"), 0.01),
-    "C": Letter(np.dtype("<u2"), 0.01),
-    "e": Letter(np.dtype("<i4"), 0.01),
-    "E": Letter(np.dtype("<u4"), 0.01),
-    "L": Letter(np.dtype("<i4"), 1e-7),
+    "c": Letter(np.dtype("<i2"), 1e2),
+    "C": Letter(np.dtype("<u2"), 1e2),
+    "e": Letter(np.dtype("<i4"), 1e2),
+    "E": Letter(np.dtype("<u4"), 1e2),
+    "L": Letter(np.dtype("<i4"), 1e7),
     "M": Letter(np.dtype("u1")),
 }
 """Every format letter: centi units, 1e-7 degrees and flight modes among numbers and texts."""
@@ -148,17 +148,17 @@ class Rows:
         return self.stored(column).astype(np.int64)
 
     def numbers(self, column: str) -> NDArray[np.float64]:
-        """A column as numbers, (n,), with the factor of its letter (centi units, 1e-7 degrees)."""
-        values, factor = self.stored(column).astype(np.float64), self.layout.letter(column).factor
-        return values if factor is None else values * factor
+        """A column as numbers, (n,), divided by what its letter says (centi units, 1e-7 degrees)."""
+        values, divisor = self.stored(column).astype(np.float64), self.layout.letter(column).divisor
+        return values if divisor is None else values / divisor
 
     def in_unit(self, column: str, multiplier: float = 1.0) -> NDArray[np.float64]:
-        """A column in its unit, (n,). A multiplier applies to stored integers whose letter has no factor: the log's
+        """A column in its unit, (n,). A multiplier applies to stored integers whose letter says nothing: the log's
         own, else `multiplier`."""
         letter = self.layout.letter(column)
-        if letter.dtype.kind == "f" or letter.factor is not None:
+        if letter.dtype.kind == "f" or letter.divisor is not None:
             return self.numbers(column)
-        return self.numbers(column) * self.multipliers.get(column, multiplier)
+        return self.numbers(column) / (1.0 / self.multipliers.get(column, multiplier))  # 1 / 1e-3 is exact, 1e-3 not
 
     def texts(self, column: str) -> list[str]:
         """A column of texts; bytes that are no UTF-8 are replaced."""
