@@ -44,7 +44,7 @@ class DataflashFlight:
         self.temperature = generator.normal(30, 3, samples).astype(np.float32).astype(float)
         self.mag_us = self.t_us[::5] + 7
         self.magnetometer = generator.integers(-600, 600, (len(self.mag_us), 3)) / 1e3
-        self.gps_us = self.t_us[::10] + 11
+        self.gps_us = self.t_us[::10] // 1000 * 1000  # whole ms as GPS time: one offset to the epoch
         place = np.array([471_234_567, 81_234_567, 42_000]) + generator.integers(-900, 900, (len(self.gps_us), 3))
         self.position = place / np.array([1e7, 1e7, 1e2])
         self.velocity = generator.normal(size=(len(self.gps_us), 3)).astype(np.float32).astype(float)

@@ -149,7 +149,9 @@ class Rows:
 
     def numbers(self, column: str) -> NDArray[np.float64]:
         """A column as numbers, (n,), divided by what its letter says (centi units, 1e-7 degrees)."""
-        values, divisor = self.stored(column).astype(np.float64), self.layout.letter(column).divisor
+        divisor = self.layout.letter(column).divisor
+        with np.errstate(invalid="ignore"):  # damaged bytes may be a NaN that signals
+            values = self.stored(column).astype(np.float64)
         return values if divisor is None else values / divisor
 
     def in_unit(self, column: str, multiplier: float = 1.0) -> NDArray[np.float64]:

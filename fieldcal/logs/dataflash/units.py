@@ -126,7 +126,9 @@ def magnetometer_sources(
     names = unit_ids(ids, "magnetometer", summary, log_name)
     sources = []
     for number, stream in enumerate(found):
-        offsets = stream.vectors(OFFSETS) if all(name in stream.rows for name in OFFSETS) else None
+        offsets = None
+        if all(name in stream.rows for name in OFFSETS):
+            offsets = np.stack([stream.rows.numbers(name) for name in OFFSETS], axis=1)  # milligauss, as the parameters
         order = np.argsort(stream.t_ns, kind="stable")
         corrections = magnetometer_corrections(
             stream.instance, parameters, stream.t_ns[order], None if offsets is None else offsets[order]

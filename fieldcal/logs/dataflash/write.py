@@ -24,6 +24,8 @@ from fieldcal.logs.dataflash.records import FMT_LAYOUT, FMT_TYPE, LETTERS, LONGE
 MULTIPLIERS: Mapping[str, float] = {"-": 0.0, "?": 1.0, "0": 1.0, "A": 0.1, "B": 0.01, "C": 1e-3, "F": 1e-6, "G": 1e-7}
 """Multiplier by its letter, as in ArduPilot's MULT messages."""
 FIRST_TYPE = 130
+HEAD, TYPE = "0xA395", "0x"
+"""Names of a message's first bytes, which no column has."""
 FREE_TYPES = (*range(FIRST_TYPE, 256), *range(1, FMT_TYPE))
 MILLIGAUSS_PER_GAUSS = 1e3
 
@@ -47,12 +49,12 @@ class Messages:
     def dtype(self) -> np.dtype[np.void]:
         """A message as it is stored: head, then the columns packed."""
         fields = [(name, LETTERS[letter].dtype) for name, letter in zip(self.columns, self.letters, strict=True)]
-        return np.dtype([("head", "S2"), ("type", "u1"), *fields])
+        return np.dtype([(HEAD, "S2"), (TYPE, "u1"), *fields])
 
     def packed(self, type_id: int) -> NDArray[np.uint8]:
         """The messages as bytes, (n, size). Raises ValueError where numbers do not fit their format."""
         rows = np.zeros(len(self.t_us), self.dtype)
-        rows["head"], rows["type"], rows[self.columns[0]] = MARK, type_id, self.t_us
+        rows[HEAD], rows[TYPE], rows[self.columns[0]] = MARK, type_id, self.t_us
         for name, given in self.values.items():
             letter = LETTERS[self.letters[self.columns.index(name)]]
             numbers = np.asarray(given)
