@@ -65,8 +65,12 @@ def test_a_flight_of_3_4() -> None:
     assert facts["rows"]["imu"] == 3755
     assert (facts["temperature_min_degc"] or 0) > 28
     assert (facts["temperature_max_degc"] or 0) < 36
+    fastest: dict[str, float] = {}
+    for table, columns in open_log(named("copter-3.4.4/log_0036.bin"), vehicle()).batches():
+        if table.startswith("imu"):
+            fastest[table] = max(float(np.abs(columns[f"gyroscope_{axis}"]).max()) for axis in "xyz")
+    assert fastest == pytest.approx({"imu": 6.48, "imu.1": 6.77}, abs=0.01)
     frames, _ = read_flight(named("copter-3.4.4/log_0036.bin"), vehicle())
-    assert max(frames["imu"][f"gyroscope_{axis}"].abs().max() for axis in "xyz") == pytest.approx(6.8, abs=0.1)
     speed = frames["gnss_velocity"].select("velocity_north_mps", "velocity_east_mps").to_numpy()
     assert np.hypot(*speed.T).max() == pytest.approx(5.6, abs=0.1)
     assert frames["gnss_velocity"]["velocity_sd_mps"].null_count() == 0
