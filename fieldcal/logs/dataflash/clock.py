@@ -40,7 +40,10 @@ class Epoch:
 def stamps_ns(rows: Rows) -> NDArray[np.int64] | None:
     """Time since boot of each message, (n,) ns; None where the messages carry none. Logs before 3.3 have ms."""
     if "TimeUS" in rows:
-        return np.clip(rows.stored("TimeUS").astype(np.float64), 0, NO_LATER_US).astype(np.int64) * 1000
+        stored = rows.stored("TimeUS")
+        if stored.dtype.kind == "u":
+            return np.minimum(stored.astype(np.uint64), np.uint64(NO_LATER_US)).astype(np.int64) * 1000
+        return np.clip(rows.integers("TimeUS"), 0, NO_LATER_US) * 1000
     if rows.layout.name == "GPS" and "T" in rows:  # before 3.3 TimeMS of GPS is GPS time
         return rows.integers("T") * 1_000_000
     return rows.integers("TimeMS") * 1_000_000 if "TimeMS" in rows else None
@@ -52,6 +55,7 @@ def sampled_ns(t_ns: NDArray[np.int64], sample_us: NDArray[np.int64], bits: int)
     behind_us = t_ns // 1000 - sample_us
     if bits < 64:
         behind_us = (behind_us + (1 << (bits - 1))) % (1 << bits) - (1 << (bits - 1))
+    behind_us = np.clip(behind_us, -LATEST_SAMPLE_NS, LATEST_SAMPLE_NS)  # keeps products within int64
     plausible = (np.abs(behind_us) * 1000 <= LATEST_SAMPLE_NS) & (sample_us > 0)
     return np.where(plausible, t_ns - t_ns % 1000 - behind_us * 1000, t_ns)
 
@@ -62,7 +66,7 @@ def epoch(gps: Rows | None) -> Epoch | None:
         return None
     t_ns = stamps_ns(gps)
     week, milliseconds = ("GWk", "GMS") if "GWk" in gps else ("Week", "TimeMS")
-    if t_ns is None or not {week, milliseconds, "Status"} <= set(gps.layout.columns):
+    if t_ns is None or not all(name in gps for name in (week, milliseconds, "Status")):
         return None
     weeks, ms = gps.integers(week), gps.integers(milliseconds)
     dated = (gps.integers("Status") >= LEAST_FIX) & (weeks > 0) & (ms < WEEK_S * 1000)

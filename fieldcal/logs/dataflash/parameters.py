@@ -28,7 +28,7 @@ class Parameters:
 
     def __init__(self, rows: Rows | None, t_ns: Iterable[int]) -> None:
         self._history: dict[str, list[tuple[int, float]]] = {}
-        if rows is None or "Value" not in rows or "Name" not in rows.layout.columns:
+        if rows is None or "Value" not in rows or not rows.has_text("Name"):
             return
         for name, value, at_ns in zip(rows.texts("Name"), rows.numbers("Value").tolist(), t_ns, strict=True):
             history = self._history.setdefault(name, [])

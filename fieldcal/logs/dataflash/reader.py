@@ -18,7 +18,7 @@ from fieldcal.logs.dataflash import report, signals, units
 from fieldcal.logs.dataflash.clock import epoch, stamps_ns
 from fieldcal.logs.dataflash.file import DataflashFile
 from fieldcal.logs.dataflash.parameters import Parameters
-from fieldcal.logs.dataflash.signals import Stream
+from fieldcal.logs.dataflash.signals import ANGLES, Stream
 from fieldcal.logs.interface import Batch, LogSummary, logged_units
 from fieldcal.reason_codes import ReasonCode
 
@@ -133,7 +133,12 @@ class DataflashLog:
 
     def _first(self, name: str, malformed: dict[str, int]) -> Stream | None:
         """The first instance of what a vehicle has one of."""
-        found = signals.streams(self._file, name, NEEDED[name], malformed)
+        needed = NEEDED[name]
+        if name == "VISP":
+            rows = self._file.rows(name)
+            later = rows is not None and ANGLES[1][0] in rows
+            needed = (*needed, *ANGLES[later])
+        found = signals.streams(self._file, name, needed, malformed)
         return next(iter(found.values()), None)
 
     def _tell_units(self, parameters: Parameters) -> None:

@@ -127,6 +127,10 @@ class Rows:
         """Whether there is a column of this name that holds one number."""
         return self.layout.is_number(column)
 
+    def has_text(self, column: str) -> bool:
+        """Whether there is a column of this name that holds texts."""
+        return column in self.layout.columns and self.layout.letter(column).dtype.kind == "S"
+
     def where(self, kept: NDArray[np.bool_]) -> Rows:
         """The rows for which `kept` (n,) holds."""
         return Rows(self.layout, self.content, self.starts[kept], self.multipliers)
@@ -144,8 +148,9 @@ class Rows:
         return everywhere[self.starts]
 
     def integers(self, column: str) -> NDArray[np.int64]:
-        """A column of whole numbers as they are stored, (n,); floats lose their fraction."""
-        return self.stored(column).astype(np.int64)
+        """A column of whole numbers as they are stored, (n,); floats are cut, to 0 where they are not finite."""
+        stored = self.stored(column)
+        return (np.nan_to_num(stored, posinf=0, neginf=0) if stored.dtype.kind == "f" else stored).astype(np.int64)
 
     def numbers(self, column: str) -> NDArray[np.float64]:
         """A column as numbers, (n,), divided by what its letter says (centi units, 1e-7 degrees)."""
@@ -170,6 +175,8 @@ class Rows:
 def multipliers(fmtu: Rows | None, mult: Rows | None, layouts: Mapping[int, Layout]) -> dict[int, dict[str, float]]:
     """Type → column → multiplier, from the log's FMTU and MULT messages. A multiplier of 0 stands for none."""
     if fmtu is None or mult is None:
+        return {}
+    if not ("FmtType" in fmtu and fmtu.has_text("MultIds") and "Id" in mult and "Mult" in mult):
         return {}
     factors = dict(zip(mult.integers("Id").tolist(), mult.numbers("Mult").tolist(), strict=True))
     found: dict[int, dict[str, float]] = {}

@@ -86,9 +86,9 @@ def report_dropouts(file: DataflashFile, summary: LogSummary) -> None:
 
 
 def describe(file: DataflashFile, epoch: Epoch | None, summary: LogSummary) -> list[str]:
-    """Firmware, board and date as metadata. Returns the texts of the log's MSG messages."""
+    """Firmware, board and date as metadata. Returns the different texts of the log's MSG messages."""
     rows = file.rows("MSG")
-    texts = rows.texts("Message") if rows is not None and "Message" in rows.layout.columns else []
+    texts = list(dict.fromkeys(rows.texts("Message"))) if rows is not None and rows.has_text("Message") else []
     for text in texts:
         board = BOARD.match(text)
         if FIRMWARE.match(text):
@@ -99,7 +99,7 @@ def describe(file: DataflashFile, epoch: Epoch | None, summary: LogSummary) -> l
         elif OPERATING_SYSTEM.match(text):
             summary.metadata.setdefault("operating_system", text)
     versions = file.rows("VER")
-    if versions is not None and "FWS" in versions.layout.columns:
+    if versions is not None and versions.has_text("FWS"):
         summary.metadata.setdefault("firmware", versions.texts("FWS")[0])
     if epoch is not None:
         summary.metadata["epoch"] = (

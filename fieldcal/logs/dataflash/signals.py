@@ -28,6 +28,7 @@ ACCELEROMETER = ("AccX", "AccY", "AccZ")
 MAGNETOMETER = ("MagX", "MagY", "MagZ")
 OFFSETS = ("OfsX", "OfsY", "OfsZ")
 MOTORS = (("MOX", "MOY", "MOZ"), ("MOfsX", "MOfsY", "MOfsZ"))
+ANGLES = (("Roll", "Pitch", "Yaw"), ("R", "P", "Y"))
 MILLI, CENTI = 1e-3, 1e-2
 NO_ACCURACY_MPS = 655.0
 """GPA.SAcc at the end of its range: the receiver does not say."""
@@ -159,8 +160,7 @@ def vps(stream: Stream) -> Columns:
     rows, t_ns = stream.rows, stream.t_ns
     if "CTimeMS" in rows:
         t_ns = sampled_ns(t_ns, rows.integers("CTimeMS") * 1000, 64)
-    names = next(n for n in (("R", "P", "Y"), ("Roll", "Pitch", "Yaw")) if all(name in rows for name in n))
-    attitude = from_euler(np.deg2rad(stream.vectors(names)))
+    attitude = from_euler(np.deg2rad(stream.vectors(next(n for n in ANGLES if n[0] in rows))))
     columns: Columns = {"t_ns": t_ns}
     columns |= {f"q{axis}": np.ascontiguousarray(attitude[:, i]) for i, axis in enumerate("xyzw")}
     return columns | {f"p{axis}_m": rows.in_unit(f"P{axis.upper()}") for axis in "xyz"}
