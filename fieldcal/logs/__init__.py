@@ -81,7 +81,7 @@ def batch_frame(table: str, columns: Columns) -> pl.DataFrame:
     """A batch as a frame with every column of its signal table; those the log lacks are null."""
     rows = len(columns["t_ns"])
     series = []
-    for name in SIGNAL_COLUMNS[table]:
+    for name in SIGNAL_COLUMNS[table.partition(".")[0]]:  # "imu.1" is of a further unit
         dtype = pl.Int64 if name == "t_ns" else pl.Float64
         if name in columns:
             series.append(pl.Series(name, np.ascontiguousarray(columns[name]), dtype))

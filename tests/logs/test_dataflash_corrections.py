@@ -56,6 +56,20 @@ def test_orientation_38_is_the_matrix_of_the_firmware() -> None:
     assert np.allclose(found[0], firmware, atol=2e-4)
 
 
+@pytest.mark.parametrize(
+    ("number", "turned"),
+    [  # as Vector3::rotate of the firmware writes them out, of (1, 2, 3)
+        (41, (0.99254615 + 0.12186934 * 3, 2.0, -0.12186934 + 0.99254615 * 3)),
+        (42, (1.0, 0.5**0.5 * (2 - 3), 0.5**0.5 * (2 + 3))),
+        (43, (1.0, 0.5**0.5 * (2 + 3), 0.5**0.5 * (3 - 2))),
+    ],
+)
+def test_orientations_that_mavlink_has_no_names_for(number: int, turned: tuple[float, float, float]) -> None:
+    found = orientation_matrix(number, lambda name: 0.0)
+    assert found is not None
+    assert np.allclose(found @ [1.0, 2.0, 3.0], turned, atol=1e-7)
+
+
 def test_custom_orientations_take_their_angles() -> None:
     angles = {"CUST_ROT1_ROLL": 10.0, "CUST_ROT1_PITCH": -20.0, "CUST_ROT1_YAW": 35.0}
     found = orientation_matrix(101, angles.__getitem__)

@@ -21,7 +21,7 @@ from logs_support import vehicle
 from pymavlink.rotmat import Matrix3
 
 from fieldcal.errors import UnreadableLog
-from fieldcal.logs import LogSummary, open_log
+from fieldcal.logs import LogSummary, open_log, read_log
 from fieldcal.logs.dataflash import signals, write
 from fieldcal.logs.dataflash.clock import leap_seconds, sampled_ns
 from fieldcal.logs.dataflash.parameters import Parameters
@@ -423,6 +423,11 @@ def test_a_configured_unit_overrules_the_logs(tmp_path: Path, flight: DataflashF
     reader = open_log(path, vehicle(units={"magnetometer": "uT"}))
     assert reader.summary.units["magnetometer"] == "uT"
     assert "unit_conflict" in [str(finding.code) for finding in reader.summary.findings]
+
+
+def test_a_log_in_memory_holds_the_further_units_too(tmp_path: Path, flight: DataflashFlight) -> None:
+    frames, _ = read_log(flight.write(tmp_path / "a.bin"), vehicle())
+    assert frames["imu.1"]["gyroscope_x"].to_list() == flight.gyroscope_1[:, 0].tolist()
 
 
 def test_a_tidy_flight_holds_the_primary_units(tmp_path: Path, flight: DataflashFlight) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ HEAD_BYTES = 3
 LONGEST = 255
 FMT_TYPE = 128
 FMT_BYTES = 89
+DIFFERENT_TYPES = 256
+"""One byte names the type; logs that were joined define each again and again."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,7 @@ class Layout:
         return column in self.columns and self.letter(column).dtype.kind in "iuf"
 
 
+@lru_cache(DIFFERENT_TYPES)
 def parse_fmt(message: bytes) -> Layout | None:
     """The layout in one FMT message of `FMT_BYTES` bytes; None where this is none: names have to be words.
 
