@@ -124,6 +124,8 @@ class ReasonCode(StrEnum):
     """Messages without a stamp of their own."""
     PACKED_MESSAGES = "packed_messages"
     """Messages that were compressed one by one."""
+    NO_GPS_FIX = "no_gps_fix"
+    """GPS messages without a position."""
     UNIT_CONFLICT = "unit_conflict"
     """Log and configuration, or the axes of one sensor, name different units."""
     UNIT_NOT_SUPPORTED = "unit_not_supported"

@@ -15,6 +15,7 @@ import polars as pl
 from fieldcal.config.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.csv.reader import CsvLog
+from fieldcal.logs.dataflash.reader import DataflashLog
 from fieldcal.logs.discovery import find_logs, flight_id, log_format, log_sha256
 from fieldcal.logs.interface import (
     SIGNAL_COLUMNS,
@@ -30,10 +31,13 @@ from fieldcal.logs.mcap.reader import McapLog
 from fieldcal.logs.ulog.reader import UlogLog
 from fieldcal.reason_codes import ReasonCode
 
-READERS: dict[str, Callable[[Path, Vehicle], LogReader]] = {"mcap": McapLog, "csv": CsvLog, "ulog": UlogLog}
+READERS: dict[str, Callable[[Path, Vehicle], LogReader]] = {
+    "mcap": McapLog,
+    "csv": CsvLog,
+    "ulog": UlogLog,
+    "dataflash": DataflashLog,
+}
 """Log format (as `discovery.log_format` names it) -> reader."""
-
-_NOT_YET = {"dataflash": "ArduPilot DataFlash"}
 
 
 def open_log(path: Path, vehicle: Vehicle) -> LogReader:
@@ -42,7 +46,7 @@ def open_log(path: Path, vehicle: Vehicle) -> LogReader:
     Parameters
     ----------
     path : Path
-        An `.mcap`, `.ulg` or `.csv` file, or a folder with `imu.csv`.
+        An `.mcap`, `.ulg`, `.bin` (ArduPilot) or `.csv` file, or a folder with `imu.csv`.
     vehicle : Vehicle
         Configuration of its vehicle: topics, columns, units.
 
@@ -55,7 +59,7 @@ def open_log(path: Path, vehicle: Vehicle) -> LogReader:
         raise UnreadableLog(ReasonCode.NOT_FOUND, f"{path.name} does not exist. Check the path.")
     kind = log_format(path)
     if kind not in READERS:
-        what = _NOT_YET.get(kind or "", f"a {path.suffix or 'folder without imu.csv'}")
+        what = f"a {path.suffix or 'folder without imu.csv'}"
         raise UnreadableLog(
             ReasonCode.FORMAT_NOT_SUPPORTED,
             f"{path.name} is {what}, which cannot be read. Convert it to MCAP or CSV.",
@@ -94,6 +98,7 @@ __all__ = [
     "Batch",
     "Columns",
     "CsvLog",
+    "DataflashLog",
     "Finding",
     "LogFile",
     "LogReader",

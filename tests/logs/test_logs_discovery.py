@@ -98,7 +98,7 @@ def test_the_hash_is_of_the_content_not_of_the_place(archive: Path, tmp_path: Pa
 
 @pytest.mark.parametrize(
     ("name", "code"),
-    [("f.bin", "format_not_supported"), ("f.txt", "format_not_supported")],
+    [("f.db", "format_not_supported"), ("f.txt", "format_not_supported")],
 )
 def test_formats_that_are_not_read(tmp_path: Path, name: str, code: str) -> None:
     with pytest.raises(UnreadableLog, match="Convert it") as caught:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from dataflash_support import DataflashFlight
 
 from fieldcal.config.configuration import Vehicle, load, parse
 from fieldcal.config.reader_settings import READ, reader_settings
@@ -26,9 +27,19 @@ class Watched:
         return getattr(self.content, name)
 
 
+def write_dataflash_flight(archive: Path) -> None:
+    """What the simulation does not write."""
+    (archive / "v" / "s").mkdir(parents=True)
+    DataflashFlight(50).write(archive / "v" / "s" / "a.bin")
+    (archive / "fieldcal.toml").write_text("")
+
+
 @pytest.mark.parametrize("log_format", READERS)
 def test_a_reader_reads_nothing_that_its_key_does_not_hold(tmp_path: Path, log_format: str) -> None:
-    write_flights(tmp_path, Experiment(duration_s=5.0), log_format=log_format)
+    if log_format == "dataflash":
+        write_dataflash_flight(tmp_path)
+    else:
+        write_flights(tmp_path, Experiment(duration_s=5.0), log_format=log_format)
     (log,) = find_logs(tmp_path)
     watched = Watched(load(tmp_path / "fieldcal.toml").vehicle(log.vehicle_id))
     tables, _ = read_log(log.path, cast(Vehicle, watched))

@@ -1,0 +1,189 @@
+"""FMT messages, format letters and multipliers of DataFlash; counts and values against pymavlink's."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dataflash_support import DataflashFlight, by_pymavlink
+
+from fieldcal.errors import UnreadableLog
+from fieldcal.logs.dataflash import file as dataflash_file
+from fieldcal.logs.dataflash.file import DataflashFile
+from fieldcal.logs.dataflash.records import LETTERS, parse_fmt
+
+FMT = struct.Struct("<3sBB4s16s64s")
+EXTREMES = {
+    "b": (-128, 127),
+    "B": (0, 255),
+    "h": (-32768, 32767),
+    "H": (0, 65535),
+    "i": (-(2**31), 2**31 - 1),
+    "I": (0, 2**32 - 1),
+    "q": (-(2**53), 2**53),
+    "Q": (0, 2**53),
+    "c": (-32768, 32767),
+    "C": (0, 65535),
+    "e": (-(2**31), 2**31 - 1),
+    "E": (0, 2**32 - 1),
+    "L": (-1_800_000_000, 1_800_000_000),
+    "M": (0, 20),
+    "f": (-1.5e30, 2.5),
+    "d": (-1.5e300, 2.5),
+    "g": (-1.5, 2.5),
+}
+PACK = {letter: letter for letter in "bBhHiIqQfd"} | {
+    "c": "h",
+    "C": "H",
+    "e": "i",
+    "E": "I",
+    "L": "i",
+    "M": "B",
+    "g": "e",
+}
+
+
+def fmt(type_id: int, size: int, name: str, letters: str, columns: str) -> bytes:
+    return FMT.pack(b"\xa3\x95\x80", type_id, size, name.encode(), letters.encode(), columns.encode())
+
+
+def own_fmt() -> bytes:
+    return fmt(128, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")
+
+
+def test_every_letter_reads_as_pymavlink_reads_it(tmp_path: Path) -> None:
+    content = own_fmt()
+    for number, letter in enumerate(EXTREMES):
+        content += fmt(200 + number, 3 + struct.calcsize("<" + PACK[letter]), f"T{number}", letter, "V")
+    for number, (letter, values) in enumerate(EXTREMES.items()):
+        for value in values:
+            content += struct.pack("<2sB" + PACK[letter], b"\xa3\x95", 200 + number, value)
+    (tmp_path / "a.bin").write_bytes(content)
+    file = DataflashFile(tmp_path / "a.bin")
+    file.locate({f"T{number}" for number in range(len(EXTREMES))})
+    _, theirs = by_pymavlink(tmp_path / "a.bin")
+    for number, letter in enumerate(EXTREMES):
+        rows = file.rows(f"T{number}")
+        assert rows is not None
+        assert rows.numbers("V").tolist() == theirs[f"T{number}"]["V"], letter
+    assert set(LETTERS) == {*EXTREMES, *"anNZ"}
+
+
+def test_texts_and_arrays(tmp_path: Path) -> None:
+    samples = list(range(-16, 16))
+    content = own_fmt() + fmt(200, 3 + 4 + 16 + 64 + 64, "T", "nNZa", "A,B,C,D")
+    content += struct.pack("<2sB4s16s64s32h", b"\xa3\x95", 200, b"abcd", b"x" * 16, b"caf\xc3\xa9\0rest", *samples)
+    (tmp_path / "a.bin").write_bytes(content)
+    file = DataflashFile(tmp_path / "a.bin")
+    file.locate({"T"})
+    rows = file.rows("T")
+    assert rows is not None
+    assert (rows.texts("A"), rows.texts("B"), rows.texts("C")) == (["abcd"], ["x" * 16], ["café"])
+    assert rows.stored("D").tolist() == [samples]
+    assert "D" not in rows
+    assert "A" not in rows
+
+
+def test_a_multiplier_applies_to_stored_integers_only(tmp_path: Path) -> None:
+    path = DataflashFlight(40).write(tmp_path / "a.bin")
+    file = DataflashFile(path)
+    file.locate({"MAG", "GPS", "IMU"})
+    mag, gps, imu = file.rows("MAG"), file.rows("GPS"), file.rows("IMU")
+    assert mag is not None
+    assert gps is not None
+    assert imu is not None
+    assert np.array_equal(mag.in_unit("MagX", 1.0), mag.integers("MagX") / 1e3)
+    assert mag.in_unit("TimeUS")[0] == pytest.approx(mag.integers("TimeUS")[0] * 1e-6)
+    assert np.array_equal(gps.in_unit("Alt"), gps.integers("Alt") / 100)  # FMTU says 0.01 too: once
+    assert np.array_equal(imu.in_unit("GyrX"), imu.stored("GyrX").astype(float))
+
+
+@pytest.mark.parametrize(
+    ("message", "columns"),
+    [
+        (fmt(130, 12, "ABC", "Qb", "TimeUS,V"), ("TimeUS", "V")),
+        (fmt(130, 13, "ABC", "Qb", "TimeUS,V"), ()),  # its length is not that of its fields
+        (fmt(130, 12, "ABC", "Qb", "TimeUS"), ()),
+        (fmt(130, 12, "ABC", "Qb", "V,V"), ()),
+        (fmt(130, 12, "ABC", "Q?", "TimeUS,V"), None),
+        (fmt(130, 12, "", "Qb", "TimeUS,V"), None),
+        (fmt(130, 12, "A C", "Qb", "TimeUS,V"), None),
+        (fmt(130, 2, "ABC", "Qb", "TimeUS,V"), None),
+        (fmt(130, 12, "ABC", "Qb", "TimeUS,\xa3"), None),
+        (fmt(130, 12, "ABC", "Qb", "TimeUS,V")[:-1], None),
+    ],
+)
+def test_definitions_that_contradict_themselves(message: bytes, columns: tuple[str, ...] | None) -> None:
+    layout = parse_fmt(message)
+    assert (None if layout is None else layout.columns) == columns
+
+
+def test_a_type_whose_length_is_wrong_is_stepped_over(tmp_path: Path) -> None:
+    content = own_fmt() + fmt(130, 14, "ODD", "Qb", "TimeUS,V") + fmt(131, 12, "TST", "Qb", "TimeUS,V")
+    for number in range(5):
+        content += b"\xa3\x95\x82" + bytes(11) + struct.pack("<2sBQb", b"\xa3\x95", 131, number, number)
+    (tmp_path / "a.bin").write_bytes(content)
+    file = DataflashFile(tmp_path / "a.bin")
+    file.locate({"TST", "ODD"})
+    rows = file.rows("TST")
+    assert rows is not None
+    assert rows.integers("V").tolist() == [0, 1, 2, 3, 4]
+    assert file.rows("ODD") is None
+    assert file.unreadable() == {"ODD": 5}
+    assert file.tally.stretches == 0
+
+
+def test_behind_a_second_definition_messages_are_left_out(tmp_path: Path) -> None:
+    first, other = fmt(131, 12, "TST", "Qb", "TimeUS,V"), fmt(131, 12, "TST", "Qb", "TimeUS,W")
+    message = struct.pack("<2sBQb", b"\xa3\x95", 131, 1, 1)
+    (tmp_path / "a.bin").write_bytes(own_fmt() + first + message * 3 + first + message * 2 + other + message * 4)
+    file = DataflashFile(tmp_path / "a.bin")
+    file.locate({"TST"})
+    assert file.counts() == {"FMT": 4, "TST": 5}
+    assert file.tally.redefined == {"TST": 4}
+
+
+def test_counts_and_values_are_pymavlinks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataflash_file, "CHUNK_BYTES", 1000)  # messages lie across the borders of chunks
+    path = DataflashFlight().write(tmp_path / "a.bin")
+    file = DataflashFile(path)
+    counts, theirs = by_pymavlink(path)
+    file.locate(counts.keys())
+    assert file.counts() == counts
+    for name, columns in theirs.items():
+        rows = file.rows(name)
+        assert rows is not None
+        for column, values in columns.items():
+            if column in rows:
+                assert rows.numbers(column).tolist() == values, (name, column)
+
+
+def test_what_looks_like_a_head_within_data_is_none(tmp_path: Path) -> None:
+    content = own_fmt() + fmt(131, 15, "TST", "QI", "TimeUS,V")
+    values = np.random.default_rng(0).choice([0x83_95A3, 0x8395A3 << 8, 0x95A3, 0xA3, 0xA3 << 24, 7], 4000).tolist()
+    for number, value in enumerate(values):
+        content += struct.pack("<2sBQI", b"\xa3\x95", 131, number, value)
+    (tmp_path / "a.bin").write_bytes(content)
+    file = DataflashFile(tmp_path / "a.bin")
+    file.locate({"TST"})
+    rows = file.rows("TST")
+    assert rows is not None
+    assert rows.integers("V").tolist() == values
+    assert file.tally.stretches == 0
+
+
+@pytest.mark.parametrize("content", [b"x", b"\xa3\x95\x80", bytes(1000), b"\xa3\x95\x80" * 300, b"\x89MCAP0\r\n" * 9])
+def test_what_is_no_dataflash_log(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.bin").write_bytes(content)
+    with pytest.raises(UnreadableLog, match=r"a\.bin is no ArduPilot log") as raised:
+        DataflashFile(tmp_path / "a.bin")
+    assert raised.value.reason_code == "not_an_autopilot_log"
+
+
+def test_an_empty_file(tmp_path: Path) -> None:
+    (tmp_path / "a.bin").write_bytes(b"")
+    with pytest.raises(UnreadableLog) as raised:
+        DataflashFile(tmp_path / "a.bin")
+    assert raised.value.reason_code == "empty_file"
