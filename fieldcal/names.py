@@ -153,3 +153,7 @@ Equations = Literal["all", "scalar"]
 InitialAttitude = Literal["estimated", "fixed"]
 SegmentEnds = Literal["odd", "even"]
 ProfileName = Literal["full", "onboard", "paper"]
+
+
+FIELD_ASSUMED = "assumed"
+"""`field_source` where neither the configuration nor the log says where it was flown: length 1, north, dip unknown."""

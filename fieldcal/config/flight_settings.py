@@ -15,7 +15,7 @@ from fieldcal.config.configuration import Vehicle, VehicleTable
 from fieldcal.config.parameters import Parameters
 from fieldcal.geometry.earth_field import UNIT_IN_TESLA, in_unit, world_magnetic_model
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import SENSORS, Approach, Rotation, Sensor, Signs, Triple
+from fieldcal.names import FIELD_ASSUMED, SENSORS, Approach, Rotation, Sensor, Signs, Triple
 
 DATE_WHEN_UNKNOWN = datetime(2025, 1, 1, tzinfo=UTC)
 STANDARD_GRAVITY_MPS2 = 9.80665
@@ -132,7 +132,7 @@ def _local_field(
     elif position is not None:
         place, unit, source = position, logged_unit if logged_unit in UNIT_IN_TESLA else "uT", "logged place"
     else:
-        return np.array([1.0, 0.0, 0.0]), "norm", "north and down assumed"
+        return np.array([1.0, 0.0, 0.0]), "norm", FIELD_ASSUMED
     dated = "" if started_at is not None else ", date unknown: 2025-01-01"
     field = world_magnetic_model(*place, started_at or DATE_WHEN_UNKNOWN)
     return in_unit(field, unit), unit, f"World Magnetic Model at the {source}{dated}"

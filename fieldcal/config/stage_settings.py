@@ -79,9 +79,10 @@ class ReferenceReading(Units):
 
 @dataclass(frozen=True, kw_only=True)
 class FieldStrength(StageSettings):
-    """Local magnetic field, in a unit that does not matter here."""
+    """Local magnetic field, in a unit that does not matter here, and where it is known from."""
 
     field_ned: Triple
+    field_source: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,7 +201,6 @@ class AttitudeSettings(BodyVectors, Gravity):
     """Stages `attitude` and `attitude_pass2`."""
 
     attitude: AttitudeFit
-    field_source: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,7 +260,7 @@ class VpsReference(Axes, VpsAttitude, VpsClock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointSettings(LoggedValues, ReferenceReading, LocalField, Gravity, GravitySign, VpsReference):
+class JointSettings(BodyVectors, ReferenceReading, LocalField, Gravity, VpsReference):
     """Stage `joint`."""
 
     method: Mapping[Sensor, Approach]
@@ -289,11 +289,12 @@ class VerifySettings(BodyVectors, Gravity, SmoothingSettings, Differentiation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChoiceSettings(Axes):
+class ChoiceSettings(Axes, NominalScale):
     """Stage `choice`."""
 
     method: Mapping[Sensor, Approach]
     field_ned: Triple
+    prior_scale_sd: float
 
 
 # --- from a flight's settings, and to and from the plain JSON of a record

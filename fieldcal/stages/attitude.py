@@ -12,14 +12,21 @@ from fieldcal.estimation import wahba
 from fieldcal.estimation.faults import Fault
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, from_matrix, multiply
-from fieldcal.names import VECTOR_SENSORS, Json, Sensor, Status
+from fieldcal.names import FIELD_ASSUMED, VECTOR_SENSORS, Json, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables, spread_of
 from fieldcal.stages.results import StageResult, fault_rows
 from fieldcal.stages.tables import QUATERNION, columns_of, constants, matrix, triad
 
 if TYPE_CHECKING:
-    from fieldcal.config.stage_settings import AttitudeSettings, Axes, BodyVectors, LoggedValues, VectorConstants
+    from fieldcal.config.stage_settings import (
+        AttitudeSettings,
+        Axes,
+        BodyVectors,
+        FieldStrength,
+        LoggedValues,
+        VectorConstants,
+    )
 
 # The weight of an attitude halves where a measured length is off by this share of gravity, or of the local field.
 TRUST_ACCELERATION, TRUST_FIELD = 0.01, 0.01
@@ -80,6 +87,15 @@ def body_vectors(
     return np.stack([field, sensor_model.GRAVITY_SIGNS[s.gravity_sign] * gravity], axis=1)
 
 
+def local_field(vectors: Array, s: FieldStrength) -> Array:
+    """The local field (3,), NED. Where nobody said where that is, its dip is the one that calibrated vectors
+    (n, 2, 3), field and gravity in body axes, have to each other."""
+    if s.field_source != FIELD_ASSUMED:
+        return np.asarray(s.field_ned, dtype=float)
+    dip = np.radians(np.nanmedian(_dip_deg(vectors)))
+    return float(np.linalg.norm(s.field_ned)) * np.array([np.cos(dip), 0.0, np.sin(dip)])
+
+
 def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
     """samples and both triads' constants → attitude (Eq. 9), weighted by the errors of the measured lengths.
 
@@ -107,8 +123,9 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
     field_excess = np.linalg.norm(vectors[:, 0], axis=1) / strength - 1.0
     acceleration_excess = np.linalg.norm(vectors[:, 1], axis=1) / gravity - 1.0
     sigma = np.array([spread_of(field_excess), spread_of(acceleration_excess)])
-    reference = np.array([s.field_ned, [0.0, 0.0, 1.0]])
-    declination = float(np.arctan2(s.field_ned[1], s.field_ned[0]))
+    field = local_field(vectors, s)
+    reference = np.array([field, [0.0, 0.0, 1.0]])
+    declination = float(np.arctan2(field[1], field[0]))
     fit = wahba.attitudes(vectors, reference, sigma, method=s.attitude, declination=declination)
     weight = 1.0 / (1.0 + (acceleration_excess / TRUST_ACCELERATION) ** 2 + (field_excess / TRUST_FIELD) ** 2)
     dip = _dip_deg(vectors)[weight >= np.quantile(weight, 1.0 - TRUSTED_SHARE)]

@@ -14,6 +14,7 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import SENSORS, Approach, Json, Method, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables
+from fieldcal.stages.joint.judgement import LARGEST_PRIOR_DISTANCE_SD
 from fieldcal.stages.motor_field import allow_for_motor_field
 from fieldcal.stages.results import StageResult, fatal_fault
 from fieldcal.stages.tables import AXES, calibration_rows, constants, matrix, seconds, triad
@@ -42,6 +43,7 @@ def choose(tables: Tables, s: ChoiceSettings) -> StageResult:
     if "motor_faults" in tables:
         rows = _with_motor_field(rows, tables["motor_faults"], float(np.linalg.norm(s.field_ned)))
     measured: dict[str, Json] = {}
+    rows = _implausible(rows, s)
     for name in ("vps_faults", "joint_faults"):
         rows = _of_wrong_clocks(rows, tables.get(name))
     against = _contradicted(rows, tables, s)
@@ -75,6 +77,24 @@ def choose(tables: Tables, s: ChoiceSettings) -> StageResult:
             chosen[sensor] = Approach.JOINT
     measured["chosen"] = chosen
     return StageResult({"calibration": rows}, measured=measured)
+
+
+def _implausible(rows: pl.DataFrame, s: ChoiceSettings) -> pl.DataFrame:
+    """Every method's gyroscope or accelerometer refused whose scale is further from the logged unit's than any part is
+    made: a fit that went wrong somewhere is not right along the other axes."""
+    for sensor in (Sensor.GYROSCOPE, Sensor.ACCELEROMETER):
+        nominal = s.nominal_scale[sensor]
+        if nominal is None:
+            continue
+        scales = rows.filter(sensor=sensor, parameter="scale").filter(pl.col("axis").is_in(AXES))
+        for (method,), own in scales.partition_by("method", as_dict=True).items():
+            size = np.abs([nominal[AXES.index(axis)] for axis in own["axis"]])
+            off = np.abs(own["value"].to_numpy() / size) - 1.0
+            sd = own["sd"].to_numpy() / size
+            known = LARGEST_PRIOR_DISTANCE_SD * s.prior_scale_sd + LARGEST_PRIOR_DISTANCE_SD * sd
+            if np.any(np.abs(off) > known):
+                rows = _refused(rows, sensor, [str(method)], None, ReasonCode.PRIOR_CONTRADICTED)
+    return rows
 
 
 def _of_wrong_clocks(rows: pl.DataFrame, faults: pl.DataFrame | None) -> pl.DataFrame:

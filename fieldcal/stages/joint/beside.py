@@ -16,6 +16,8 @@ from fieldcal.stages.results import quantity_rows
 from fieldcal.stages.tables import AXES, CalibrationRow
 
 LEVER_ARM, VPS_LEVER_ARM, DELAY, DIP, G_SENSITIVITY = "lever_arm", "vps_lever_arm", "delay", "dip", "g_sensitivity"
+# Sd beyond which a number says nothing and is no row, by parameter: m, s, rad, and the reading's unit per m/s².
+LARGEST_SD = {LEVER_ARM: 0.5, VPS_LEVER_ARM: 0.5, DELAY: 0.05, DIP: 0.2, G_SENSITIVITY: np.inf}
 BOTH_AXES = tuple(row + column for row in AXES for column in AXES)
 
 
@@ -32,6 +34,8 @@ def beside_rows(
     rows: list[CalibrationRow] = []
 
     def add(sensor: Sensor, parameter: str, at: tuple[str, ...], value: Array, sd: Array, unit: str) -> None:
+        if not np.max(sd) <= LARGEST_SD[parameter]:
+            return
         rows.extend(
             quantity_rows(sensor, Method.JOINT, parameter, at, value, sd, unit=unit, temperature_degc=temperature_degc)
         )

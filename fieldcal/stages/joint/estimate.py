@@ -20,9 +20,9 @@ from fieldcal.estimation.joint.problem import TERMS, PriorConstants, Readings
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array, from_matrix, multiply
-from fieldcal.names import SENSORS, Approach, Json, Method, Rung, Sensor, Status
+from fieldcal.names import FIELD_ASSUMED, SENSORS, VECTOR_SENSORS, Approach, Json, Method, Rung, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.stages.attitude import logged_constants
+from fieldcal.stages.attitude import body_vectors, local_field, logged_constants, vector_constants
 from fieldcal.stages.inputs import Tables, is_sound, mean_temperature, reference_reading, refusal
 from fieldcal.stages.joint.beside import beside_rows
 from fieldcal.stages.joint.by_vps import (
@@ -275,10 +275,20 @@ def readings_of(tables: Tables, s: JointSettings) -> Readings:
         gyroscope=logged["gyroscope"],
         force=_force(tables, s, given["accelerometer"]),
         gravity_mps2=sensor_model.GRAVITY_SIGNS[s.gravity_sign] * s.gravity_mps2,
-        field_ned=np.asarray(s.field_ned, dtype=float),
+        field_ned=_field(tables, s, given),
         turning=initialise.turning(t, segment, logged["gyroscope"]),
         **given,
     )
+
+
+def _field(tables: Tables, s: JointSettings, given: Mapping[str, Array | None]) -> Array:
+    """The local field (3,), NED; of an unknown place with the dip that both triads show, where they can be
+    calibrated."""
+    used = {name: vector_constants(tables, s, name)[0] for name in VECTOR_SENSORS if given[name] is not None}
+    known = {name: found for name, found in used.items() if found is not None}
+    if s.field_source != FIELD_ASSUMED or len(known) < len(VECTOR_SENSORS):
+        return np.asarray(s.field_ned, dtype=float)
+    return local_field(body_vectors(tables["samples"], known, s, prefix="smoothed_"), s)
 
 
 def each_once(x: Array) -> Array:
