@@ -91,7 +91,8 @@ def candidates(fit: JointFit) -> list[str]:
     if readings.warmth is not None and float(np.ptp(readings.warmth)) > LEAST_TEMPERATURE_RANGE_DEGC:
         out.append("gyroscope_temperature")
     # Vectors alone can't tell it: the same accelerometer would be both the cause and the witness.
-    force = None if fit.vps is None else readings.force
+    # Nor where the walk had to be held down: then the poses' error is coloured, and it would take that for its own.
+    force = readings.force if fit.vps is not None and fit.options.walk_ratio >= 1.0 else None
     if force is not None and float(np.sqrt(np.mean(np.sum(force**2, axis=1)))) > LEAST_FORCE_MPS2:
         out.append("gyroscope_g_sensitivity")
     if float(np.sqrt(np.mean(np.sum(fit.path.rate**2, axis=1)))) > LEAST_RATE_RADPS:
