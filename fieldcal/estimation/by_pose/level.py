@@ -24,10 +24,13 @@ def ned_from_world(down: ArrayLike | None, field: ArrayLike | None, field_ned: A
     total = np.eye(3)
     if down is not None:
         d = np.asarray(down, dtype=float) / np.linalg.norm(down)
+        if d[2] < 0.0:  # upside down: half a turn about x first, since no arc is the shortest from there
+            total = np.diag([1.0, -1.0, -1.0])
+            d = total @ d
         axis = np.cross(d, [0.0, 0.0, 1.0])
         # The shortest turn that brings d to the vertical (Rodrigues).
         s = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
-        total = np.eye(3) + s + s @ s / max(1.0 + d[2], 1e-9)
+        total = (np.eye(3) + s + s @ s / (1.0 + d[2])) @ total
     if field is not None:
         seen, true = total @ np.asarray(field, dtype=float), np.asarray(field_ned, dtype=float)
         turn = np.arctan2(true[1], true[0]) - np.arctan2(seen[1], seen[0])
