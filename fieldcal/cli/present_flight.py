@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from fieldcal.cli.show import table
-from fieldcal.names import Status
+from fieldcal.names import Status, exactness
 from fieldcal.schemas.rows import CalibrationRow, FitRow, FlightDocument, UnfoldedRun
 from fieldcal.stages.tables import AXES
 from fieldcal.words.flights import QUANTITIES, advised, is_consequence, sync_sentence, verdict_sentence
@@ -42,11 +42,13 @@ def print_flight(console: Console, document: FlightDocument) -> None:
 
 
 def parameter_table(rows: Sequence[CalibrationRow]) -> Table:
-    """scale, zero and bias of every sensor and method, an axis a line. A refused axis says so."""
+    """scale, zero and bias of every sensor and method, the most exact first, an axis a line. A refused axis says so."""
     by_place = {(r["sensor"], r["method"], r["axis"], r["parameter"]): r for r in rows}
     lines = []
     shown: tuple[str, str] | None = None
-    for sensor, method in dict.fromkeys((r["sensor"], r["method"]) for r in rows):
+    order = list(dict.fromkeys(r["sensor"] for r in rows))
+    places = dict.fromkeys((r["sensor"], r["method"]) for r in rows)
+    for sensor, method in sorted(places, key=lambda place: (order.index(place[0]), exactness(place[1]))):
         for axis in AXES:
             own = [by_place.get((sensor, method, axis, parameter)) for parameter in PARAMETERS]
             first = next((row for row in own if row is not None), None)

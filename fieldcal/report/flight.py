@@ -8,6 +8,7 @@ from datetime import datetime
 import polars as pl
 
 from fieldcal.names import PREFERRED_METHODS, Json, Status, exactness
+from fieldcal.report import flight_evidence
 from fieldcal.report import flight_figures as draw
 from fieldcal.report.flight_curves import Curves, curves
 from fieldcal.report.flight_data import FlightData
@@ -242,7 +243,25 @@ def _figures(data: FlightData) -> list[Section]:
             Table("What the gates measured", (Column("stage"), Column("status"), Column("measured", "wide")), lines)
         )
     sections = [Section("figures", "Figures 5–10", parts)]
+    rests_on = _evidence(data)
+    sections += [Section("evidence", "What the estimate rests on", rests_on)] if rests_on else []
     return [*sections, Section("quality", "Residuals and gates", quality)] if quality else sections
+
+
+def _evidence(data: FlightData) -> list[Part]:
+    """Along the joint estimate's attitude, else the two vectors'."""
+    parts: list[Part | None] = [
+        flight_evidence.methods(data.calibration),
+        flight_evidence.prior_and_posterior(data.calibration, data.parameters),
+    ]
+    samples = data.tables.get("smoothing.samples")
+    attitudes = (data.tables.get(name) for name in ("joint.trajectory", "attitude_pass2.attitude"))
+    attitude = next((table for table in attitudes if table is not None and not table.is_empty()), None)
+    if samples is not None and attitude is not None and attitude.height == samples.height and data.settings is not None:
+        found = flight_evidence.evidence(samples, attitude, data.calibration, data.settings)
+        if found is not None:
+            parts += [flight_evidence.residuals(found), flight_evidence.information(found)]
+    return [part for part in parts if part is not None]
 
 
 def _fits(c: Curves, fit: Sequence[FitRow]) -> list[Part]:

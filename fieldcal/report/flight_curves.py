@@ -13,7 +13,7 @@ from fieldcal.estimation.gyroscope.output_error import propagate_stretches, star
 from fieldcal.estimation.segments import begins_run, run_bounds
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, conjugate, continuous, multiply, to_rotation_vector
-from fieldcal.names import Method, Sensor
+from fieldcal.names import Method, Sensor, Status, exactness
 from fieldcal.report.flight_data import FigureSettings
 from fieldcal.stages.attitude import sensor_attitude
 from fieldcal.stages.inputs import differentiate_by_segment
@@ -107,9 +107,19 @@ def finite(own: tuple[Array, Array]) -> bool:
     return all(bool(np.isfinite(part).all()) for part in own)
 
 
+def counting(calibration: pl.DataFrame, sensor: Sensor) -> pl.DataFrame:
+    """A sensor's rows by the method that counts: of those with a scale published the most exact, else of all."""
+    scales = calibration.filter(pl.col("sensor") == sensor, pl.col("parameter") == "scale")
+    published = scales.filter(pl.col("status") == Status.OK)
+    methods = (scales if published.is_empty() else published)["method"].unique().to_list()
+    if not methods:
+        return calibration.clear()
+    return calibration.filter(pl.col("sensor") == sensor, pl.col("method") == min(methods, key=exactness))
+
+
 def lengths(samples: pl.DataFrame, calibration: pl.DataFrame, name: Sensor) -> Array | None:
     """Calibrated vectors (n, 3) of the magnetometer or accelerometer, unsmoothed, sensor axes; None without a fit."""
-    rows = calibration.filter(pl.col("value").is_not_null(), pl.col("sensor") == name)
+    rows = counting(calibration, name).filter(pl.col("value").is_not_null())
     if rows.is_empty() or set(rows["parameter"].to_list()) < {"scale", "bias"}:
         return None
     own = constants(rows, name, refused_too=True)

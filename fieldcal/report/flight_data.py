@@ -22,7 +22,13 @@ from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.stage_store import StageStore, outputs_of
 from fieldcal.words.rows import rows_of, typed, unfolded
 
-STAGE_TABLES = ("manoeuvre.segments", "smoothing.samples", "attitude_pass2.attitude", "vps_sync.vps_aligned")
+STAGE_TABLES = (
+    "manoeuvre.segments",
+    "smoothing.samples",
+    "attitude_pass2.attitude",
+    "joint.trajectory",
+    "vps_sync.vps_aligned",
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ import polars as pl
 
 from fieldcal.geometry.rotation import Array, continuous, euler_angles
 from fieldcal.names import Sensor, Status
-from fieldcal.report.flight_curves import Curves, covered_cells, lengths
+from fieldcal.report.flight_curves import Curves, counting, covered_cells, lengths
 from fieldcal.report.flight_data import FigureSettings
 from fieldcal.report.page import Plot
 from fieldcal.report.plot import INK, XYZ, backdrop, curve, headed, legend, panels, solid_panels, svg, without_wraps
@@ -117,7 +117,7 @@ def spheres(samples: pl.DataFrame, calibration: pl.DataFrame, settings: FigureSe
         for label, setter in zip("xyz", (axis.set_xlabel, axis.set_ylabel, axis.set_zlabel), strict=True):
             setter(label, fontsize=8)
         axis.tick_params(labelsize=7, pad=-1)
-    refused = [name for name in found if (calibration.filter(pl.col("sensor") == name)["status"] != Status.OK).any()]
+    refused = [name for name in found if (counting(calibration, name)["status"] != Status.OK).any()]
     caption = "Figure 6. Calibrated readings (unsmoothed, sensor axes) on the sphere of the local field and of gravity"
     caption += f"; every {-(-max(map(len, found.values())) // SPHERE_POINTS)}th sample."
     if refused:
