@@ -8,8 +8,10 @@ import pytest
 import fieldcal
 from fieldcal.flight.calibrate import identify, read, run_stages
 from fieldcal.names import Sensor
-from fieldcal.report.flight_data import of_log
+from fieldcal.report.flight_curves import counting
+from fieldcal.report.flight_data import FlightData, of_log
 from fieldcal.report.flight_evidence import Evidence, _by_block, _turn_error, _vector_angle, evidence, methods
+from fieldcal.report.flight_figures import spheres
 from fieldcal.report.page import Plot
 
 
@@ -55,6 +57,11 @@ def test_the_page_has_them(data: FlightData) -> None:
         "evidence-residuals",
         "evidence-information",
     ]
-    drawn = methods(data.calibration)
-    assert drawn is not None
-    assert "not chosen" in str(drawn.svg)
+    assert methods(data.calibration.clear()) is None
+
+
+def test_the_method_that_counts_is_what_figures_show(data: FlightData) -> None:
+    assert set(counting(data.calibration, Sensor.ACCELEROMETER)["method"]) == {"joint"}
+    assert data.settings is not None
+    balls = spheres(data.tables["smoothing.samples"], data.calibration, data.settings)
+    assert "refused" not in balls[0].caption
