@@ -79,9 +79,15 @@ class ReferenceReading(Units):
 
 @dataclass(frozen=True, kw_only=True)
 class FieldStrength(StageSettings):
-    """Local magnetic field, in a unit that does not matter here, and where it is known from."""
+    """Local magnetic field, in a unit that does not matter here."""
 
     field_ned: Triple
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldOrigin(FieldStrength):
+    """The same, and where it is known from."""
+
     field_source: str
 
 
@@ -197,7 +203,7 @@ class AccelerometerSettings(EllipsoidSettings, Gravity):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AttitudeSettings(BodyVectors, Gravity):
+class AttitudeSettings(BodyVectors, Gravity, FieldOrigin):
     """Stages `attitude` and `attitude_pass2`."""
 
     attitude: AttitudeFit
@@ -260,7 +266,7 @@ class VpsReference(Axes, VpsAttitude, VpsClock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointSettings(BodyVectors, ReferenceReading, LocalField, Gravity, VpsReference):
+class JointSettings(BodyVectors, ReferenceReading, LocalField, FieldOrigin, Gravity, VpsReference):
     """Stage `joint`."""
 
     method: Mapping[Sensor, Approach]
@@ -281,7 +287,7 @@ class VpsSyncSettings(LoggedValues, Axes, VpsAttitude, VpsClock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerifySettings(BodyVectors, Gravity, SmoothingSettings, Differentiation):
+class VerifySettings(BodyVectors, FieldOrigin, Gravity, SmoothingSettings, Differentiation):
     """Stage `verify`."""
 
     attitude: AttitudeFit

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         AttitudeSettings,
         Axes,
         BodyVectors,
-        FieldStrength,
+        FieldOrigin,
         LoggedValues,
         VectorConstants,
     )
@@ -87,7 +87,7 @@ def body_vectors(
     return np.stack([field, sensor_model.GRAVITY_SIGNS[s.gravity_sign] * gravity], axis=1)
 
 
-def local_field(vectors: Array, s: FieldStrength) -> Array:
+def local_field(vectors: Array, s: FieldOrigin) -> Array:
     """The local field (3,), NED. Where nobody said where that is, its dip is the one that calibrated vectors
     (n, 2, 3), field and gravity in body axes, have to each other."""
     if s.field_source != FIELD_ASSUMED:

@@ -39,9 +39,7 @@ def choose(tables: Tables, s: ChoiceSettings) -> StageResult:
         return StageResult(
             status=Status.REFUSED, reason_code=ReasonCode.NOTHING_CALIBRATED, reason="No method gave constants."
         )
-    rows = pl.concat(parts)
-    if "motor_faults" in tables:
-        rows = _with_motor_field(rows, tables["motor_faults"], float(np.linalg.norm(s.field_ned)))
+    rows = _with_motor_field(pl.concat(parts), tables.get("motor_faults"), float(np.linalg.norm(s.field_ned)))
     measured: dict[str, Json] = {}
     rows = _implausible(rows, s)
     for name in ("vps_faults", "joint_faults"):
@@ -105,10 +103,10 @@ def _of_wrong_clocks(rows: pl.DataFrame, faults: pl.DataFrame | None) -> pl.Data
     return _refused(rows, Sensor.GYROSCOPE, rows["method"].unique().to_list(), None, code)
 
 
-def _with_motor_field(rows: pl.DataFrame, faults: pl.DataFrame, strength: float) -> pl.DataFrame:
+def _with_motor_field(rows: pl.DataFrame, faults: pl.DataFrame | None, strength: float) -> pl.DataFrame:
     """The joint magnetometer's rows with what the motors may have spoilt; the ellipsoid's have it already."""
-    found = faults.filter(reason_code=str(ReasonCode.MOTOR_FIELD))
-    if found.is_empty():
+    found = None if faults is None else faults.filter(reason_code=str(ReasonCode.MOTOR_FIELD))
+    if found is None or found.is_empty():
         return rows
     own = (pl.col("sensor") == Sensor.MAGNETOMETER) & (pl.col("method") == Method.JOINT)
     widened = allow_for_motor_field(rows.filter(own), float(found["number"][0]), strength)

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 import fieldcal
 from fieldcal.config.configuration import CsvMap, McapMap
-from fieldcal.errors import UnreadableLog
 from fieldcal.estimation import motor_field as numerics
 from fieldcal.estimation.motor_field import (
     FATAL_SHARE,
@@ -402,8 +401,10 @@ def test_mcap_batteries_are_read_by_type_or_topic_and_as_magnitudes(tmp_path: Pa
     frames, summary = read_log(two, vehicle(mcap=McapMap(power="/b")))
     assert frames["power"]["current_a"].to_list() == [3.0, 4.0]
     assert summary.findings == []
-    with pytest.raises(UnreadableLog, match=r"mcap\.power"):
-        read_log(two, vehicle(mcap=McapMap(power="/c")))
+    frames, summary = read_log(two, vehicle(mcap=McapMap(power="/c")))
+    assert "power" not in frames
+    assert [finding.code for finding in summary.findings] == ["missing_topic"]
+    assert "mcap.power" in summary.findings[0].sentence
 
 
 def test_a_log_without_a_current_has_no_such_table(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ WITHIN = 0.002
 def calibrated(case: str, log: str = "log", config: str | None = "fieldcal.toml") -> FlightDocument:
     """What `fieldcal calibrate --json` prints of a case."""
     folder = CASES / case
-    return fieldcal.calibrate(folder / log, config=folder / config if config else None).document
+    return fieldcal.calibrate(folder / log, method="serial", config=folder / config if config else None).document
 
 
 def findings(document: FlightDocument) -> dict[str, str]:
@@ -198,6 +198,6 @@ def test_one_of_two_imus_is_chosen(tmp_path_factory: pytest.TempPathFactory, ins
     config = tmp_path_factory.mktemp("config") / "fieldcal.toml"
     text = (folder / "fieldcal.toml").read_text()
     config.write_text(text.replace("[defaults.csv]", f'[defaults.csv]\ninstance = "{instance}"'))
-    document = fieldcal.calibrate(folder / "log", config=config).document
+    document = fieldcal.calibrate(folder / "log", method="serial", config=config).document
     assert document["flight"]["imu_rate_hz"] == pytest.approx(185.12, abs=0.02)
     assert scales(document) == pytest.approx(scale, rel=0.025)

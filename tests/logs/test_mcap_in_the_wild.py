@@ -170,11 +170,13 @@ def test_an_estimate_of_the_vehicles_own_is_no_reference(tmp_path: Path) -> None
     assert "/vicon/pose is used" in summary.findings[0].sentence
     assert len(summary.findings) == 1
     alone = own + [row for row in both if row[1] != POSE]
-    _, summary = read_log(messages.write(tmp_path / "b.mcap", alone), vehicle())
+    frames, summary = read_log(messages.write(tmp_path / "b.mcap", alone), vehicle())
     assert [finding.code for finding in summary.findings] == ["vps_is_estimate"]
+    assert "vps" not in frames
     named = McapMap(vps="/mavros/local_position/pose")
-    _, summary = read_log(tmp_path / "b.mcap", vehicle(mcap=named))
+    frames, summary = read_log(tmp_path / "b.mcap", vehicle(mcap=named))
     assert summary.findings == []
+    assert "vps" in frames
 
 
 def test_halves_of_an_imu_are_joined(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock
 # Chance peaks of unrelated motions reach 0.9 in the coarse correlation; the vector fit tells them apart.
 MOST_GRID_PER_SAMPLE = 20  # a grid over hours of which minutes were recorded fills the memory with gaps
 MIN_EXPLAINED, MAX_SKEW_PPM, MAX_LAG_SD_S = 0.6, 2000.0, 0.01
-SURELY_EXPLAINED = 0.9  # share from which an impossible clock, not another motion, is what differs
+SURELY_EXPLAINED = 0.97  # share from which an impossible clock, not another motion, is what differs
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,8 @@ def add_terms(fit: JointFit) -> tuple[JointFit, list[TermTest]]:
 
 def _doubted(fit: JointFit, moved: list[dict[str, Array]]) -> JointFit:
     """The fit with these changes of its parameters, by name, in the covariance."""
+    if not moved:
+        return fit
     covariance = fit.covariance.copy()
     for change in moved:
         by = np.zeros(len(covariance))

@@ -127,6 +127,8 @@ def choose_sources(
     vps = next((source.topic for source in sources if source.role == "vps"), None)
     if not mapping.vps:
         tell_of_references(vps, definitions, summary, log_name)
+        if vps is not None and is_estimate(vps):
+            sources = [source for source in sources if source.role != "vps"]
     given = {value for source in sources for value in source.values}
     if not given & {"gyroscope", "accelerometer", "magnetometer"}:
         raise UnreadableLog(

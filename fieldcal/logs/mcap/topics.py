@@ -16,14 +16,15 @@ ESTIMATES = ("local_position", "global_position", "ekf", "estimat", "filtered", 
 
 
 def tell_of_references(vps: str | None, definitions: Definitions, summary: LogSummary, log_name: str) -> None:
-    """Findings on a VPS that nothing configures: its topic `vps` carries an estimate of the vehicle's own, or there is
-    none and transforms are not read."""
+    """Findings on a VPS that nothing configures: its topic `vps` carries an estimate of the vehicle's own, which is not
+    used then, or there is none and transforms are not read."""
     if vps is not None and is_estimate(vps):
         summary.add(
             ReasonCode.VPS_IS_ESTIMATE,
             1,
-            f"{log_name}: {vps} is taken for the VPS, but looks like the vehicle's own estimate, which has seen the "
-            "IMU already: agreement with it proves nothing. Name the topic of a reference as mcap.vps.",
+            f"{log_name}: {vps} is the only pose, but looks like the vehicle's own estimate, which has seen the IMU "
+            "already: agreement with it proves nothing, and it is not used as VPS. If it is a reference, name it as "
+            "mcap.vps.",
         )
     unread = [
         f"{topic} ({type_name_of(channels[0], definitions)})"

@@ -3,7 +3,7 @@ specific force. Each has its own unit and sd; none of them is asked for by a cal
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -25,16 +25,17 @@ def beside_rows(
     fit: JointFit,
     by_pose: Mapping[Sensor, TriadByPose | FieldcalError],
     axes: Array,
+    sensors: Collection[Sensor],
     *,
     gyroscope_unit: str,
     temperature_degc: float | None,
 ) -> list[CalibrationRow]:
     """Rows of a fit and of the triads that a VPS's trajectory gave, if any; `axes` (3, 3) turns sensor axes into body
-    axes."""
+    axes; `sensors`: of which there may be rows."""
     rows: list[CalibrationRow] = []
 
     def add(sensor: Sensor, parameter: str, at: tuple[str, ...], value: Array, sd: Array, unit: str) -> None:
-        if not np.max(sd) <= LARGEST_SD[parameter]:
+        if sensor not in sensors or not np.max(sd) <= LARGEST_SD[parameter]:
             return
         rows.extend(
             quantity_rows(sensor, Method.JOINT, parameter, at, value, sd, unit=unit, temperature_degc=temperature_degc)

@@ -394,10 +394,12 @@ def _written(
         )
     if Sensor.GYROSCOPE in triads:
         rows += _slope_rows(fit, tables, s, triads[Sensor.GYROSCOPE].zero_codes)
+    told = [name for name, v in triads.items() if None in (*v.codes, *v.zero_codes)]
     rows += beside_rows(
         fit,
         by_pose,
         _axes(s),
+        told,
         gyroscope_unit=s.units[Sensor.GYROSCOPE],
         temperature_degc=mean_temperature(tables),
     )

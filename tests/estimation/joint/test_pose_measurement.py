@@ -80,4 +80,8 @@ def test_a_vps_of_another_motion_is_left_out() -> None:
         signals(r) | {"vps": signals(other)["vps"]}, settings(r.experiment, method="joint", use_vps=True)
     )
     assert results["joint"].measured["use_vps"] is False
-    assert results["joint"].measured["use_vps_reason"] in ("flat_peak", "ambiguous_peak", "not_the_same_motion")
+    assert results["joint"].measured["use_vps_reason"] in (
+        "flat_peak",
+        "ambiguous_peak",
+        "not_the_same_motion",
+    )
