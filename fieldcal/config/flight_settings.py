@@ -37,7 +37,7 @@ class FlightSettings:
     nominal_scale : |scale| from logged to calibrated unit, None where nobody knows it (counts)
     reference_reading : d0 of `zero_bias`, None leaves it to the readings
     applied_matrix, applied_offset : what an autopilot had made of raw readings before it logged them (`logs.applied`),
-        and how far that changed within the flight; None where they are raw
+        whether that is known whole, and how far it changed within the flight; None where they are raw
     """
 
     parameters: Parameters
@@ -57,6 +57,7 @@ class FlightSettings:
     reference_reading: Mapping[Sensor, Triple | None]
     applied_matrix: Mapping[Sensor, Rotation | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
     applied_offset: Mapping[Sensor, Triple | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
+    applied_known: Mapping[Sensor, bool | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
     applied_matrix_sd: Mapping[Sensor, float | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
     applied_offset_sd: Mapping[Sensor, Triple | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
 

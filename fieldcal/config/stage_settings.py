@@ -309,6 +309,7 @@ class CompositionSettings(StageSettings):
 
     applied_matrix: Mapping[Sensor, Rotation | None]
     applied_offset: Mapping[Sensor, Triple | None]
+    applied_known: Mapping[Sensor, bool | None]
     applied_matrix_sd: Mapping[Sensor, float | None]
     applied_offset_sd: Mapping[Sensor, Triple | None]
 

@@ -15,13 +15,15 @@ class Applied(TypedDict):
     """logged = matrix · raw + offset, raw readings in the axes of the logged ones: the mounting is taken out.
 
     `matrix` (3, 3) symmetric; `offset` (3,) in the logged unit, at the flight's temperatures; `matrix_sd`, `offset_sd`
-    (3,): how far they changed within the flight; `parameters`: those of the longest stretch."""
+    (3,): how far they changed within the flight; `parameters`: those of the longest stretch; `known`: false where the
+    log does not have them, so that what was done is not known."""
 
     matrix: list[list[float]]
     offset: list[float]
     matrix_sd: float
     offset_sd: list[float]
     parameters: dict[str, float]
+    known: bool
 
 
 def applied(sources: Sequence[SensorSource], first_ns: int, last_ns: int) -> dict[str, Applied]:
@@ -45,6 +47,7 @@ def applied(sources: Sequence[SensorSource], first_ns: int, last_ns: int) -> dic
             "offset": offset.tolist(),
             "matrix_sd": float(np.sqrt(np.max(np.tensordot(weight, (matrices - matrix) ** 2, 1)))),
             "offset_sd": np.sqrt(weight @ (offsets - offset) ** 2).tolist(),
+            "known": all(one.parameters for one in source.corrections),
             "parameters": dict(source.corrections[int(np.argmax(weight))].parameters),
         }
     return out

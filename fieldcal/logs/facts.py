@@ -36,7 +36,8 @@ class Judged(TypedDict):
 
 
 class Facts(Declared, Judged):
-    """All of it. `rows` by signal table; `applied` by sensor; `position` mean latitude and longitude, degrees, and altitude, m."""
+    """All of it. `rows` by signal table; `applied` by sensor; `position` mean latitude and longitude, degrees, and
+    altitude, m."""
 
     duration_s: float | None
     imu_rate_hz: float | None

@@ -261,6 +261,7 @@ def settings_of(facts: Facts, vehicle: Vehicle) -> FlightSettings:
         own,
         applied_matrix={s: _rows_of(known[s]["matrix"]) if s in known else None for s in SENSORS},
         applied_offset={s: _triple(known[s]["offset"]) if s in known else None for s in SENSORS},
+        applied_known={s: known[s]["known"] if s in known else None for s in SENSORS},
         applied_matrix_sd={s: known[s]["matrix_sd"] if s in known else None for s in SENSORS},
         applied_offset_sd={s: _triple(known[s]["offset_sd"]) if s in known else None for s in SENSORS},
     )

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import SENSORS, Json, Status
+from fieldcal.names import RESIDUAL, SENSORS, Json, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.results import ZERO_SLOPE, StageResult
@@ -16,9 +16,6 @@ from fieldcal.stages.tables import AXES, CalibrationRow, calibration_rows
 
 if TYPE_CHECKING:
     from fieldcal.config.stage_settings import CompositionSettings
-
-RESIDUAL = "residual_"
-"""Before the parameters that hold for the readings as they are logged."""
 
 COMPOSED = ("scale", "bias", "zero", "zero_bias")
 
@@ -40,14 +37,27 @@ def compose(tables: Tables, s: CompositionSettings) -> StageResult:
         own, matrix, offset = rows.filter(sensor=sensor), s.applied_matrix[sensor], s.applied_offset[sensor]
         if matrix is None or offset is None or own.is_empty():
             continue
+        if s.applied_known[sensor] and np.allclose(matrix, np.eye(3), atol=SQUARE) and not np.any(offset):
+            out.append(own)  # by nothing but its mounting
+            continue
         composed.append(str(sensor))
         uncertain = s.applied_matrix_sd[sensor] or 0.0, np.array(s.applied_offset_sd[sensor] or (0.0, 0.0, 0.0))
         for _, of_method in own.group_by("method", maintain_order=True):
-            out.append(_of_raw(of_method, np.array(matrix), np.array(offset), *uncertain))
+            of_raw = _of_raw(of_method, np.array(matrix), np.array(offset), *uncertain)
+            out.append(of_raw if s.applied_known[sensor] else _not_known(of_raw))
             residual = of_method.filter(pl.col("parameter").is_in([*COMPOSED, ZERO_SLOPE]))
             out.append(residual.with_columns(parameter=pl.lit(RESIDUAL) + pl.col("parameter")))
     measured: dict[str, Json] = {"composed": composed} if composed else {}
     return StageResult({"calibration": pl.concat(out)}, measured=measured)
+
+
+def _not_known(rows: pl.DataFrame) -> pl.DataFrame:
+    """Rows refused: what the autopilot had done to the readings is not in the log, and so nothing of the raw sensor."""
+    which = pl.col("parameter").is_in(COMPOSED) & (pl.col("status") == Status.OK)
+    return rows.with_columns(
+        status=pl.when(which).then(pl.lit(str(Status.REFUSED))).otherwise("status"),
+        reason_code=pl.when(which).then(pl.lit(str(ReasonCode.ALREADY_CORRECTED))).otherwise("reason_code"),
+    )
 
 
 def in_log(rows: pl.DataFrame) -> pl.DataFrame:
@@ -68,7 +78,7 @@ def _of_raw(rows: pl.DataFrame, p: Array, o: Array, p_sd: float, o_sd: Array) ->
     if ZERO_SLOPE in {parameter for parameter, _ in found}:
         own = [found[ZERO_SLOPE, axis] for axis in AXES]
         slope, slope_sd = _numbers(own)
-        others += _with(own, inverse @ slope, np.sqrt(inverse**2 @ slope_sd**2))
+        others += _with(own, _through(inverse, slope), np.sqrt(_through(inverse**2, slope_sd**2)))
     if ("scale", "x") not in found or ("zero", "x") not in found:
         return calibration_rows(others)
     full = ("scale", "xy") in found or np.any(np.abs(p - np.diag(np.diagonal(p))) > SQUARE)
@@ -77,14 +87,14 @@ def _of_raw(rows: pl.DataFrame, p: Array, o: Array, p_sd: float, o_sd: Array) ->
         for j, column_axis in enumerate(AXES):
             row = found.get(("scale", row_axis + column_axis)) or (found["scale", row_axis] if i == j else None)
             if row is not None:
-                scale[i, j], scale_sd[i, j] = row["value"] or np.nan, row["sd"] or np.nan
+                (scale[i, j],), (scale_sd[i, j],) = _numbers([row])
     zero, zero_sd = _numbers([found["zero", axis] for axis in AXES])
     raw_scale = scale @ p
     raw_scale_sd = np.sqrt(scale_sd**2 @ p**2 + p_sd**2 * np.sum(scale**2, axis=1, keepdims=True))
-    raw_zero = inverse @ (zero - o)
-    raw_zero_sd = np.sqrt(inverse**2 @ (zero_sd**2 + o_sd**2))
-    bias = -raw_scale @ raw_zero
-    bias_sd = np.sqrt(raw_scale_sd**2 @ raw_zero**2 + raw_scale**2 @ raw_zero_sd**2)
+    raw_zero = _through(inverse, zero - o)
+    raw_zero_sd = np.sqrt(_through(inverse**2, zero_sd**2 + o_sd**2))
+    bias = -_through(raw_scale, raw_zero)
+    bias_sd = np.sqrt(_through(raw_scale_sd**2, raw_zero**2) + _through(raw_scale**2, raw_zero_sd**2))
     scales = [found["scale", axis] for axis in AXES]
     out = _with(scales, np.diagonal(raw_scale), np.diagonal(raw_scale_sd))
     out += _with([found["bias", axis] for axis in AXES], bias, bias_sd)
@@ -92,13 +102,18 @@ def _of_raw(rows: pl.DataFrame, p: Array, o: Array, p_sd: float, o_sd: Array) ->
     out += [found["zero_bias", axis] for axis in AXES if ("zero_bias", axis) in found]
     if full:
         for i, axis in enumerate(AXES):
-            names = [{**scales[i], "axis": axis + other} for other in AXES]
+            names = [_copied(scales[i], axis + other) for other in AXES]
             out += _with(names, raw_scale[i], raw_scale_sd[i])
     return calibration_rows(out + others)
 
 
 SQUARE = 1e-9
 """Off-diagonal share of a matrix that is rounding."""
+
+
+def _through(matrix: Array, v: Array) -> Array:
+    """matrix · v, where an unknown element of v spoils only what it has a part in."""
+    return np.asarray(np.where(matrix == 0.0, 0.0, matrix * v).sum(axis=1))
 
 
 def _numbers(rows: list[CalibrationRow]) -> tuple[Array, Array]:
@@ -108,5 +123,16 @@ def _numbers(rows: list[CalibrationRow]) -> tuple[Array, Array]:
 
 def _with(rows: list[CalibrationRow], value: Array, sd: Array) -> list[CalibrationRow]:
     """The same rows with other numbers; what is not finite is None."""
-    finite = [[float(x) if np.isfinite(x) else None for x in numbers] for numbers in (value, sd)]
-    return [{**row, "value": v, "sd": u} for row, v, u in zip(rows, *finite, strict=True)]
+    out = []
+    for row, own, own_sd in zip(rows, value, sd, strict=True):
+        new = row.copy()
+        new["value"] = float(own) if np.isfinite(own) else None
+        new["sd"] = float(own_sd) if np.isfinite(own_sd) else None
+        out.append(new)
+    return out
+
+
+def _copied(row: CalibrationRow, axis: str) -> CalibrationRow:
+    new = row.copy()
+    new["axis"] = axis
+    return new
