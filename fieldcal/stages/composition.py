@@ -31,20 +31,22 @@ def compose(tables: Tables, s: CompositionSettings) -> StageResult:
             status=Status.REFUSED, reason_code=ReasonCode.NOTHING_CALIBRATED, reason="No method gave constants."
         )
     rows = pl.concat(parts)
-    out = [rows.filter(~pl.col("sensor").is_in([name for name in SENSORS if s.applied_matrix[name] is not None]))]
+    of_matrix, of_offset, is_known = s.applied_matrix, s.applied_offset, s.applied_known
+    matrix_sd, offset_sd = s.applied_matrix_sd, s.applied_offset_sd
+    out = [rows.filter(~pl.col("sensor").is_in([name for name in SENSORS if of_matrix[name] is not None]))]
     composed: list[str] = []
     for sensor in SENSORS:
-        own, matrix, offset = rows.filter(sensor=sensor), s.applied_matrix[sensor], s.applied_offset[sensor]
+        own, matrix, offset = rows.filter(sensor=sensor), of_matrix[sensor], of_offset[sensor]
         if matrix is None or offset is None or own.is_empty():
             continue
-        if s.applied_known[sensor] and np.allclose(matrix, np.eye(3), atol=SQUARE) and not np.any(offset):
+        if is_known[sensor] and np.allclose(matrix, np.eye(3), atol=SQUARE) and not np.any(offset):
             out.append(own)  # by nothing but its mounting
             continue
         composed.append(str(sensor))
-        uncertain = s.applied_matrix_sd[sensor] or 0.0, np.array(s.applied_offset_sd[sensor] or (0.0, 0.0, 0.0))
+        uncertain = matrix_sd[sensor] or 0.0, np.array(offset_sd[sensor] or (0.0, 0.0, 0.0))
         for _, of_method in own.group_by("method", maintain_order=True):
             of_raw = _of_raw(of_method, np.array(matrix), np.array(offset), *uncertain)
-            out.append(of_raw if s.applied_known[sensor] else _not_known(of_raw))
+            out.append(of_raw if is_known[sensor] else _not_known(of_raw))
             residual = of_method.filter(pl.col("parameter").is_in([*COMPOSED, ZERO_SLOPE]))
             out.append(residual.with_columns(parameter=pl.lit(RESIDUAL) + pl.col("parameter")))
     measured: dict[str, Json] = {"composed": composed} if composed else {}
