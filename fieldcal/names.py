@@ -157,3 +157,6 @@ ProfileName = Literal["full", "onboard", "paper"]
 
 FIELD_ASSUMED = "assumed"
 """`field_source` where neither the configuration nor the log says where it was flown: length 1, north, dip unknown."""
+
+RESIDUAL = "residual_"
+"""Before the parameters that hold for readings which an autopilot had corrected before it logged them."""

@@ -213,7 +213,8 @@ PARAMETER = Column(
     "zero_per_degc: slope of the zero; lever_arm, vps_lever_arm: from the point the vehicle turns about, or the VPS's "
     "point, to the sensor, body axes; delay behind the gyroscope or the trajectory; dip of the field; g_sensitivity of "
     "the reading to specific force (the zero is that at the flight's mean force); field_per_current, "
-    "field_per_throttle: what the motors add to the reading",
+    "field_per_throttle: what the motors add to the reading; residual_...: of readings that an autopilot had corrected "
+    "before it logged them, beside which the others are the raw sensor's",
 )
 AXIS = Column("axis", _TEXT, "", "sensor axis x, y or z; full form xx, xy, ...")
 VALUE = Column("value", _F64, "named by column unit", "estimate of the parameter; null when refused without a number")

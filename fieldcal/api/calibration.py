@@ -22,6 +22,7 @@ from fieldcal.geometry import sensor_model
 from fieldcal.names import SENSORS, Approach, Json, exactness
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.rows import FlightDocument, Refusable, SyncRow
+from fieldcal.stages.composition import in_log
 from fieldcal.stages.tables import matrix, seconds
 from fieldcal.stages.vps import RATE_COLUMNS
 from fieldcal.words.flights import is_consequence
@@ -146,8 +147,9 @@ class Calibration:
     def sensor(self, sensor: str, method: str | None = None) -> SensorCalibration:
         """A sensor's constants by `method`, else by the most exact that was not refused.
 
-        Those of a method that is asked for by name are not refused for another's being chosen. A sensor that no method
-        found numbers for is there too: its values raise `Refused` with the reason.
+        They hold for the readings as they were logged; where an autopilot had corrected those, `rows` and `constants`
+        have the raw sensor's. Those of a method that is asked for by name are not refused for another's being chosen. A
+        sensor that no method found numbers for is there too: its values raise `Refused` with the reason.
 
         Raises
         ------
@@ -176,7 +178,7 @@ class Calibration:
         Refused
             No sensor has constants; the first one's reason is told.
         """
-        own = [self.sensor(name) for name in SENSORS]
+        own = [self._of_raw(self.sensor(name)) for name in SENSORS]
         flight = self.document["flight"]
         triads = {s.sensor: s.triad(f"flight {flight['flight_id']}, {s.method}") for s in own if s.ok}
         if not triads:
@@ -205,8 +207,15 @@ class Calibration:
         flight = self.document["flight"]
         return plot_calibration([self._shown(s) for s in SENSORS], f"{flight['log_uri']}: {self.verdict}")
 
+    def _of_raw(self, own: SensorCalibration) -> SensorCalibration:
+        """The same method's constants of the raw sensor, where an autopilot had corrected what it logged."""
+        if own.method is None:
+            return own
+        rows = self.rows.filter(pl.col("sensor") == own.sensor, pl.col("method") == own.method)
+        return sensor_calibration(rows, own.sensor, own.method, own.reason)
+
     def _by(self, sensor: str, method: str, *, by_name: bool = False) -> SensorCalibration:
-        rows = self.rows.filter(pl.col("sensor") == sensor, pl.col("method") == method)
+        rows = in_log(self.rows.filter(pl.col("sensor") == sensor, pl.col("method") == method))
         if by_name:
             passed_over = pl.col("reason_code") == ReasonCode.OTHER_METHOD_CHOSEN
             rows = rows.with_columns(

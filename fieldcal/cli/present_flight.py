@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from fieldcal.cli.show import table
-from fieldcal.names import Status, exactness
+from fieldcal.names import RESIDUAL, Status, exactness
 from fieldcal.schemas.rows import CalibrationRow, FitRow, FlightDocument, UnfoldedRun
 from fieldcal.stages.tables import AXES
 from fieldcal.words.flights import QUANTITIES, advised, is_consequence, sync_sentence, verdict_sentence
@@ -30,6 +30,9 @@ def print_flight(console: Console, document: FlightDocument) -> None:
             console.print(f"  {finding['sentence']}", markup=False)
     if document["calibration"]:
         console.print(parameter_table(document["calibration"]))
+        if (logged := residual_table(document["calibration"])) is not None:
+            console.print("The autopilot had corrected its readings; of those, as they are logged:", markup=False)
+            console.print(logged)
         if (beside := beside_table(document["calibration"])) is not None:
             console.print(beside)
     print_refusals(console, document["run"])
@@ -59,6 +62,14 @@ def parameter_table(rows: Sequence[CalibrationRow]) -> Table:
             status = standing(first["status"], first["reason_code"])
             lines.append([*name, axis, *(_value(row) for row in own), status])
     return table(["sensor", "method", "axis", *PARAMETERS, "status"], lines)
+
+
+def residual_table(rows: Sequence[CalibrationRow]) -> Table | None:
+    """Constants of the readings as logged, where the published ones are the raw sensor's."""
+    own = [row for row in rows if row["parameter"].startswith(RESIDUAL)]
+    return (
+        parameter_table([{**row, "parameter": row["parameter"].removeprefix(RESIDUAL)} for row in own]) if own else None
+    )
 
 
 def beside_table(rows: Sequence[CalibrationRow]) -> Table | None:

@@ -6,7 +6,7 @@ Each stage takes the part that it names (`fieldcal.config.stage_settings`), and 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -36,6 +36,8 @@ class FlightSettings:
     polarity : signs of the axes as wired
     nominal_scale : |scale| from logged to calibrated unit, None where nobody knows it (counts)
     reference_reading : d0 of `zero_bias`, None leaves it to the readings
+    applied_matrix, applied_offset : what an autopilot had made of raw readings before it logged them (`logs.applied`),
+        whether that is known whole, and how far it changed within the flight; None where they are raw
     """
 
     parameters: Parameters
@@ -53,6 +55,11 @@ class FlightSettings:
     polarity: Mapping[Sensor, Signs]
     nominal_scale: Mapping[Sensor, Triple | None]
     reference_reading: Mapping[Sensor, Triple | None]
+    applied_matrix: Mapping[Sensor, Rotation | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
+    applied_offset: Mapping[Sensor, Triple | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
+    applied_known: Mapping[Sensor, bool | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
+    applied_matrix_sd: Mapping[Sensor, float | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
+    applied_offset_sd: Mapping[Sensor, Triple | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
 
     def changed(self, **changes: object) -> FlightSettings:
         """These settings with others for some, parameters of the stages among them.

@@ -303,6 +303,17 @@ class ChoiceSettings(Axes, NominalScale):
     prior_scale_sd: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class CompositionSettings(StageSettings):
+    """Stage `composition`."""
+
+    applied_matrix: Mapping[Sensor, Rotation | None]
+    applied_offset: Mapping[Sensor, Triple | None]
+    applied_known: Mapping[Sensor, bool | None]
+    applied_matrix_sd: Mapping[Sensor, float | None]
+    applied_offset_sd: Mapping[Sensor, Triple | None]
+
+
 # --- from a flight's settings, and to and from the plain JSON of a record
 
 S = TypeVar("S", bound=StageSettings)

@@ -123,11 +123,19 @@ def apply_constants(
                 " give the vehicle whose log this is (--vehicle), or its units in fieldcal.toml.",
             )
         t_ns = table["t_ns"].to_numpy()
-        readings[name] = t_ns, constant.apply(matrix(table, triad(name)), _temperature_at(t_ns, temperature))
+        raw = raw_readings(matrix(table, triad(name)), Sensor(name), settings)
+        readings[name] = t_ns, constant.apply(raw, _temperature_at(t_ns, temperature))
         warnings += _outside(name, constant, temperature)
     if not readings:
         raise FieldcalError(ReasonCode.NO_CALIBRATION, f"{log}: no sensor of this log has constants.")
     return CalibratedReadings(readings, signals.get("temperature"), settings, constants, tuple(warnings))
+
+
+def raw_readings(logged: Array, sensor: Sensor, settings: FlightSettings) -> Array:
+    """Readings (n, 3) as the sensor gave them, in the axes of the logged ones: what an autopilot had done to them by
+    its parameters is undone."""
+    p, o = settings.applied_matrix[sensor], settings.applied_offset[sensor]
+    return logged if p is None or o is None else np.linalg.solve(np.array(p), (logged - np.array(o)).T).T
 
 
 def write_parquet(c: CalibratedReadings, folder: Path) -> list[Path]:

@@ -137,8 +137,9 @@ def tell_sources(summary: LogSummary, log_name: str, advice: str) -> None:
         summary.add(
             ReasonCode.ALREADY_CORRECTED,
             1,
-            f"{log_name}: {_listed(corrected)} had been corrected by the autopilot by its parameters; constants found "
-            f"here are what remains, and come on top of those.{told} {advice}",
+            f"{log_name}: {_listed(corrected)} had been corrected by the autopilot by its parameters; "
+            f"published are constants of the raw sensor, composed with those parameters; rows residual_… hold for the "
+            f"readings as logged.{told} {advice}",
         )
     further = [source for source in summary.sources if not source.primary]
     if further:

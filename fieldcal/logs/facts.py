@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TypedDict
 
+from fieldcal.logs.applied import Applied
+
 
 class FindingFacts(TypedDict):
     """One thing worth knowing about a log. `code` is a `ReasonCode`."""
@@ -34,7 +36,8 @@ class Judged(TypedDict):
 
 
 class Facts(Declared, Judged):
-    """All of it. `rows` by signal table; `position` mean latitude and longitude, degrees, and altitude, m."""
+    """All of it. `rows` by signal table; `applied` by sensor; `position` mean latitude and longitude, degrees, and
+    altitude, m."""
 
     duration_s: float | None
     imu_rate_hz: float | None
@@ -46,3 +49,4 @@ class Facts(Declared, Judged):
     temperature_max_degc: float | None
     started_at_ns: int | None
     position: list[float] | None
+    applied: dict[str, Applied]

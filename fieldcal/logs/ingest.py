@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -18,11 +19,12 @@ from fieldcal.config.configuration import Vehicle
 from fieldcal.config.flight_settings import FlightSettings, flight_settings
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs import SIGNAL_COLUMNS, Finding, LogReader, LogSummary, open_log
+from fieldcal.logs.applied import applied
 from fieldcal.logs.discovery import folder_parts
 from fieldcal.logs.facts import Declared, Facts, FindingFacts, Judged
 from fieldcal.logs.interface import EPOCH_KNOWN_AFTER_NS
 from fieldcal.logs.tidy import HELD_ROWS, Disordered, TidySignal
-from fieldcal.names import Verdict
+from fieldcal.names import SENSORS, Rotation, Sensor, Triple, Verdict
 from fieldcal.reason_codes import ReasonCode
 
 LEAST_SAMPLES = 10
@@ -155,6 +157,7 @@ class TidyLog:
             "temperature_max_degc": high,
             "started_at_ns": first_ns if summary.epoch_known and first_ns > EPOCH_KNOWN_AFTER_NS else None,
             "position": [float(v) for v in self._position / place.rows] if place and place.rows else None,
+            "applied": applied(summary.sources, first_ns, last_ns),
             **verdict(findings),
         }
 
@@ -209,6 +212,7 @@ def rejected(reason_code: ReasonCode, reason: str) -> Facts:
         "temperature_max_degc": None,
         "started_at_ns": None,
         "position": None,
+        "applied": {},
         **declared(LogSummary("")),
         "rows": {},
         "verdict": Verdict.REJECTED,
@@ -243,7 +247,7 @@ def started_at(facts: Facts) -> datetime | None:
 def settings_of(facts: Facts, vehicle: Vehicle) -> FlightSettings:
     """Settings of the stages for this flight (`config.flight_settings.flight_settings`)."""
     place = facts["position"]
-    return flight_settings(
+    own = flight_settings(
         vehicle,
         units=facts["units"],
         world=facts["world"],
@@ -252,3 +256,22 @@ def settings_of(facts: Facts, vehicle: Vehicle) -> FlightSettings:
         position=None if place is None else (place[0], place[1], place[2]),
         started_at=started_at(facts),
     )
+    known = {Sensor(name): found for name, found in facts["applied"].items()}
+    return replace(
+        own,
+        applied_matrix={s: _rows_of(known[s]["matrix"]) if s in known else None for s in SENSORS},
+        applied_offset={s: _triple(known[s]["offset"]) if s in known else None for s in SENSORS},
+        applied_known={s: known[s]["known"] if s in known else None for s in SENSORS},
+        applied_matrix_sd={s: known[s]["matrix_sd"] if s in known else None for s in SENSORS},
+        applied_offset_sd={s: _triple(known[s]["offset_sd"]) if s in known else None for s in SENSORS},
+    )
+
+
+def _triple(values: list[float]) -> Triple:
+    x, y, z = values
+    return x, y, z
+
+
+def _rows_of(matrix: list[list[float]]) -> Rotation:
+    x, y, z = (_triple(row) for row in matrix)
+    return x, y, z

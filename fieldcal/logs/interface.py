@@ -80,6 +80,10 @@ class Correction:
     offset_per_degc: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
+UNKNOWN = Correction(0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0), {})
+"""Something was done, and the log does not say what."""
+
+
 @dataclass(frozen=True)
 class SensorSource:
     """One sensor of one unit on board: what it is, and where in the log its readings are.

@@ -16,6 +16,7 @@ from fieldcal.names import InitialAttitude, Json, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import SIGNAL_TABLES, SchemaMismatch
 from fieldcal.schemas.rows import FitRow, SyncRow, UnfoldedFlight, UnfoldedRun
+from fieldcal.stages.composition import in_log
 from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.questions import existing
@@ -89,7 +90,7 @@ def read_flight(root: Path, flight_id: str) -> FlightData:
     sync = typed(rows_of(history["sync"]), SyncRow)
     return FlightData(
         flight,
-        history["calibration"],
+        in_log(history["calibration"]),
         typed(rows_of(history["fit"]), FitRow),
         sync[0] if sync else None,
         run,
@@ -109,7 +110,7 @@ def of_log(log: CalibratedLog) -> FlightData:
             parameters |= as_json(taken_from(log.settings, stage.takes))
     return FlightData(
         document["flight"],
-        rows_frame("calibration", document["calibration"]),
+        in_log(rows_frame("calibration", document["calibration"])),
         document["fit"],
         document["sync"],
         document["run"],

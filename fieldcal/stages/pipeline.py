@@ -15,6 +15,7 @@ from fieldcal.config.stage_settings import (
     AccelerometerSettings,
     AttitudeSettings,
     ChoiceSettings,
+    CompositionSettings,
     GatedAccelerometerSettings,
     GyroEquationPass2Settings,
     GyroEquationSettings,
@@ -35,6 +36,7 @@ from fieldcal.stages import (
     attitude,
     choice,
     comparison,
+    composition,
     gyroscope,
     preparation,
     sanity,
@@ -290,11 +292,19 @@ PIPELINE: tuple[Stage, ...] = (
         (),
         ("calibration",),
     ),
+    _stage(
+        "composition",
+        composition.compose,
+        CompositionSettings,
+        {"calibration": "choice.calibration", "warm_up": "warm_up.calibration"},
+        (),
+        ("calibration",),
+    ),
 )
 
 # The stages' tables that each published table is made of.
 PUBLISHED: dict[str, tuple[str, ...]] = {
-    "calibration": ("choice.calibration", "warm_up.calibration"),
+    "calibration": ("composition.calibration",),
     "fit": ("verify.fit",),
     "sync": ("vps_sync.sync",),
 }

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from fieldcal.names import GRAVEST_FIRST, Status
+from fieldcal.names import GRAVEST_FIRST, RESIDUAL, Status
 from fieldcal.provenance.run_key import run_key, source_digest
 from fieldcal.schemas import TABLES
 from fieldcal.schemas.rows import DriftRow
@@ -114,7 +114,9 @@ def history_of_everything(root: Path) -> pl.DataFrame:
     warehouse = Warehouse(root)
     lead = ["vehicle_id", "imu_id", "session_id", "flight_id", "started_at"]
     columns = [*lead, "sensor", "method", "parameter", "axis", "value", "sd", "unit", "temperature_degc"]
-    calibration = warehouse.scan("calibration").filter(pl.col("status") == Status.OK).select(columns)
+    # What remains of an autopilot's own correction steps with its parameters, not with the sensor.
+    own = (pl.col("status") == Status.OK) & ~pl.col("parameter").str.starts_with(RESIDUAL)
+    calibration = warehouse.scan("calibration").filter(own).select(columns)
     warm = warehouse.scan("flight").select("vehicle_id", "flight_id", temperature_degc="temperature_mean_degc")
     text = {"sensor": pl.lit(VPS), "method": pl.lit("sync"), "axis": pl.lit("")}
     flight = ["vehicle_id", "flight_id"]

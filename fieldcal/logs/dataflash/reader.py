@@ -7,6 +7,7 @@ the autopilot takes such batches of one sensor at a time, so that no gyroscope h
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from fieldcal.logs.dataflash.clock import epoch, stamps_ns
 from fieldcal.logs.dataflash.file import DataflashFile
 from fieldcal.logs.dataflash.parameters import Parameters
 from fieldcal.logs.dataflash.signals import ANGLES, Stream
-from fieldcal.logs.interface import Batch, LogSummary, logged_units
+from fieldcal.logs.interface import UNKNOWN, Batch, LogSummary, logged_units
 from fieldcal.reason_codes import ReasonCode
 
 UNITS = {"gyroscope": "rad/s", "accelerometer": "m/s^2", "magnetometer": "G"}
@@ -164,6 +165,7 @@ class DataflashLog:
                 f"{name}: {listed} had been corrected by the autopilot, and the log lacks parameters that say how; "
                 "constants found here come on top of those unknown ones. Keep the vehicle's parameter file.",
             )
+        summary.sources = [one if one.corrected else replace(one, corrections=(UNKNOWN,)) for one in summary.sources]
 
     def _advice(self, parameters: Parameters) -> str:
         said = ADVICE
