@@ -12,6 +12,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from fieldcal.logs.encodings.gather import gather
 from fieldcal.logs.mcap.records import (
     HEAD_BYTES,
     MESSAGE,
@@ -22,7 +23,6 @@ from fieldcal.logs.mcap.records import (
     Fields,
     Record,
     check_first_record,
-    gather,
     read_chunk_head,
     read_record,
 )
