@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from rosbags import rosbag1, rosbag2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
@@ -26,6 +26,8 @@ class Messages:
     def __init__(self, *, ros1: bool = False) -> None:
         self.ros1 = ros1
         self.store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+        if TRANSFORMS not in self.store.types:
+            self.store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
         self._types = self.store.types
 
     def header(self, t_ns: int, frame: str) -> Any:
@@ -66,7 +68,8 @@ class Truth:
     def __init__(self, n: int = 300, *, ros1: bool = False, first: int = 0) -> None:
         generator = np.random.default_rng(5)
         self.t_ns = START_NS + STEP_NS * np.arange(first, first + n)
-        self.rate, self.force, self.field = generator.normal(size=(3, first + n, 3))[:, first:]
+        values = generator.normal(size=(first + n, 9))[first:]
+        self.rate, self.force, self.field = values[:, :3], values[:, 3:6], values[:, 6:]
         self.messages = Messages(ros1=ros1)
         self.rows: list[Row] = []
         for t, rate, force, field in zip(self.t_ns.tolist(), self.rate, self.force, self.field, strict=True):

@@ -15,7 +15,7 @@ from fieldcal.logs.mcap.reader import McapContainer
 from fieldcal.logs.messages.container import Block, Container
 from fieldcal.logs.messages.definitions import Definitions
 from fieldcal.logs.rosbag2.metadata import read_metadata
-from fieldcal.logs.rosbag2.parts import METADATA, storage_files
+from fieldcal.logs.rosbag2.parts import METADATA, stem, storage_files
 from fieldcal.logs.rosbag2.sqlite_file import SqliteContainer
 from fieldcal.reason_codes import ReasonCode
 
@@ -106,10 +106,8 @@ class FolderContainer:
         """Storage files: those that the metadata lists in its order, then the others by number."""
         there = {path.name: path for path in storage_files(folder)}
         names = list(dict.fromkeys(self._own.names))
-        bare = {
-            name.partition(".")[0] for name in there
-        }  # bags of the first versions name files before they are packed
-        gone = [name for name in names if name not in there and name.partition(".")[0] not in bare]
+        stems = {stem(name) for name in there}  # bags of the first versions name files as before they were packed
+        gone = [name for name in names if name not in there and stem(name) not in stems]
         if gone:
             self._findings.add(
                 ReasonCode.TRUNCATED,

@@ -43,7 +43,8 @@ class Rows:
 
     def __init__(self, connection: sqlite3.Connection, table: str, columns: str) -> None:
         self._connection = connection
-        self._query = f"SELECT rowid, {columns} FROM {table} NOT INDEXED WHERE rowid > ? ORDER BY rowid"
+        # Not "> ?", which SQLite answers by way of that row itself.
+        self._query = f"SELECT rowid, {columns} FROM {table} NOT INDEXED WHERE rowid >= ? ORDER BY rowid"
         self.gaps: list[tuple[int, int]] = []
         self.damage: str | None = None
         self.gave_up = False
@@ -54,7 +55,7 @@ class Rows:
         after = _FIRST
         while True:
             try:
-                for rowid, *values in self._connection.execute(self._query, (after,)):
+                for rowid, *values in self._connection.execute(self._query, (after + 1,)):
                     if rowid <= after:
                         raise sqlite3.DatabaseError("row ids are out of order")
                     after = rowid
@@ -62,6 +63,12 @@ class Rows:
                 return
             except sqlite3.DatabaseError as error:
                 self.damage = self.damage or str(error)
+            # Python's cursor looks a row ahead: the last one before the damage is still to be had.
+            last = self._row_behind(after)
+            if last is not None:
+                after = int(last[0])
+                yield after, tuple(last[1:])
+                continue
             behind = self._behind(after)
             self.gaps.append((after, _LAST if behind is None else behind))
             if behind is None:
@@ -91,7 +98,15 @@ class Rows:
             self.gave_up = True
             return False
         try:
-            self._connection.execute(self._query, (after,)).fetchone()
+            self._connection.execute(self._query + " LIMIT 1", (after + 1,)).fetchone()
         except sqlite3.DatabaseError:
             return False
         return True
+
+    def _row_behind(self, after: int) -> tuple[int, ...] | None:
+        """The next row alone; None where it cannot be read, or has no larger row id."""
+        try:
+            row: tuple[int, ...] | None = self._connection.execute(self._query + " LIMIT 1", (after + 1,)).fetchone()
+        except sqlite3.DatabaseError:
+            return None
+        return row if row is not None and row[0] > after else None

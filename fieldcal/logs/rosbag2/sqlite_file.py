@@ -47,6 +47,7 @@ class SqliteContainer:
         page_bytes = int.from_bytes(head[16:18], "big")
         self._declared_bytes = int.from_bytes(head[28:32], "big") * (65536 if page_bytes == 1 else page_bytes)
         self._malformed = 0
+        self._unknown = 0
         self._rows: Rows | None = None
         try:
             self._connection = open_read_only(database)
@@ -78,6 +79,7 @@ class SqliteContainer:
         size = 0
         for _, (channel_id, log_time_ns, payload) in self._rows:
             if channel_id not in channels:
+                self._unknown += channel_id not in self.definitions.channels
                 continue
             if not (isinstance(channel_id, int) and isinstance(log_time_ns, int) and isinstance(payload, bytes)):
                 self._malformed += 1
@@ -115,6 +117,13 @@ class SqliteContainer:
                 ReasonCode.MALFORMED_MESSAGE,
                 self._malformed,
                 f"{self._name}: {self._malformed} rows of table messages hold no bytes or no time and were left out.",
+                loses_data=True,
+            )
+        if self._unknown:
+            summary.add(
+                ReasonCode.UNKNOWN_CHANNEL,
+                self._unknown,
+                f"{self._name}: {self._unknown} messages belong to topics that are defined nowhere in the file.",
                 loses_data=True,
             )
         if self._rows and self._rows.gaps:
