@@ -26,6 +26,9 @@ LOG_FORMATS = {
 }
 """End of a log's name → its format."""
 
+TABLE_ENDS = (".tsv", ".txt")
+"""Ends of names of tables that are read as csv where somebody names them, by a glob with that end or one by one."""
+
 CSV_FOLDER, BAG_FOLDER = "csv", "rosbag2"
 _READ_BYTES = 1 << 20
 
@@ -51,6 +54,8 @@ def log_format(path: Path) -> str | None:
             return CSV_FOLDER
         return BAG_FOLDER if is_bag_folder(path) else None
     name = path.name.lower()
+    if name.endswith(TABLE_ENDS):
+        return "csv"
     return next((kind for end, kind in LOG_FORMATS.items() if name.endswith(end)), None)
 
 
@@ -101,6 +106,8 @@ def find_logs(archive: Path, logs_map: Iterable[LogsEntry] | None = None) -> lis
     found: dict[str, LogFile] = {}
     for entry in logs_map or ():
         for path in sorted(archive.glob(entry.glob)):
+            if path.suffix.lower() in TABLE_ENDS and not entry.glob.lower().endswith(path.suffix.lower()):
+                continue
             folders = path.relative_to(archive).parts[:-1] or (path.stem,)
             _add(found, archive, root, path, entry.vehicle or folders[0], entry.session or folders[-1])
     for vehicle in _folders(archive, root):
@@ -111,17 +118,19 @@ def find_logs(archive: Path, logs_map: Iterable[LogsEntry] | None = None) -> lis
             if kind == BAG_FOLDER:  # its files are no flights of their own
                 _add(found, archive, root, session, vehicle.name, session.name)
                 continue
-            for path in _entries(session):
+            for path in entries(session):
+                if path.suffix.lower() in TABLE_ENDS:
+                    continue
                 _add(found, archive, root, path, vehicle.name, session.name)
     return sorted(found.values(), key=lambda log: log.log_uri)
 
 
 def _add(found: dict[str, LogFile], archive: Path, root: Path, path: Path, vehicle: str, session: str) -> None:
-    if not _inside(path, root):
+    if not inside(path, root):
         return
     try:
         kind = log_format(path)
-        if kind is not None and path.is_dir() and not all(_inside(part, root) for part in folder_parts(path)):
+        if kind is not None and path.is_dir() and not all(inside(part, root) for part in folder_parts(path)):
             return
     except OSError:  # a folder that may not be entered: whoever reads it will say so
         kind = CSV_FOLDER
@@ -138,17 +147,19 @@ def _format_or_none(path: Path) -> str | None:
 
 
 def _folders(folder: Path, root: Path) -> Iterator[Path]:
-    return (path for path in _entries(folder) if _inside(path, root) and path.is_dir())
+    return (path for path in entries(folder) if inside(path, root) and path.is_dir())
 
 
-def _entries(folder: Path) -> list[Path]:
+def entries(folder: Path) -> list[Path]:
+    """What a folder holds, sorted; without hidden names, nothing where it may not be entered."""
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError:
         return []
 
 
-def _inside(path: Path, root: Path) -> bool:
+def inside(path: Path, root: Path) -> bool:
+    """Whether a path exists and does not lead out of the resolved folder `root`."""
     try:
         return path.resolve(strict=True).is_relative_to(root)
     except (OSError, RuntimeError):

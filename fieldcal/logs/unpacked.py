@@ -20,7 +20,8 @@ CAP_BYTES = 64 << 30
 """A file may unpack to 512 MiB, or to 64 times its own size (recordings: 1 to 15 times), and to 64 GiB at most."""
 
 WINDOW_CAP_BYTES = 128 << 20
-_PIECE_BYTES = 1 << 20
+_PIECE_BYTES = 1 << 14
+"""What is lost before damage at most: a piece comes whole or not at all."""
 
 
 def is_packed(path: Path) -> bool:
