@@ -16,6 +16,7 @@ from logs_support import vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs import log_format, log_sha256, read_log
 from fieldcal.logs.interface import Finding, LogSummary
+from fieldcal.logs.rosbag2.metadata import read_metadata
 from fieldcal.logs.rosbag2.rows import Rows, open_read_only
 
 
@@ -133,6 +134,20 @@ def test_a_bag_that_counts_more_messages_than_it_holds_is_told(tmp_path: Path) -
     truth.check(frames)
     (finding,) = summary.findings
     assert (finding.code, finding.count, finding.loses_data) == ("count_mismatch", 22, True)
+
+
+@pytest.mark.parametrize("version", [8, 9])
+def test_metadata_is_read_as_a_yaml_library_reads_it(tmp_path: Path, version: int) -> None:
+    truth = Truth(20)
+    folder = write_rosbag2(tmp_path / "bag", truth.messages, truth.rows, version=version)
+    split(tmp_path, "mcap", 3)
+    for place in (folder, tmp_path / "split"):
+        found = read_metadata(place)
+        information = yaml.safe_load((place / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+        topics = information["topics_with_message_count"]
+        assert found.names == information["relative_file_paths"] != []
+        assert found.counts == {topic["topic_metadata"]["name"]: topic["message_count"] for topic in topics} != {}
+        assert found.damage is None
 
 
 @pytest.mark.parametrize("text", ["a: [", "- 1", "rosbag2_bagfile_information: 3", "[" * 3000, "x: &a [*a]"])

@@ -1,17 +1,22 @@
-"""`metadata.yaml` of a ROS 2 bag: which files in which order, how many messages on each topic."""
+"""`metadata.yaml` of a ROS 2 bag: which files in which order, how many messages on each topic.
+
+Two lists of it are looked for, in the block style that recorders write; a YAML library would do much more with a file
+that nobody vouches for.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
-
-import yaml
 
 from fieldcal.logs.rosbag2.parts import METADATA
 
 CAP_BYTES = 2 << 20
 """Largest `metadata.yaml` that is read; recorders write some kilobytes."""
+
+_NAME = re.compile(r"^[ \-]*name:[ ]+(\S.*?)[ ]*$", re.MULTILINE)
+_COUNT = re.compile(r"^[ \-]*message_count:[ ]+(\d{1,18})[ ]*$", re.MULTILINE)
 
 
 @dataclass
@@ -31,24 +36,43 @@ def read_metadata(folder: Path) -> BagMetadata:
     try:
         if path.stat().st_size > CAP_BYTES:
             return BagMetadata(damage=f"it is larger than {CAP_BYTES} bytes")
-        document: object = yaml.load(path.read_bytes(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except (OSError, yaml.YAMLError, UnicodeError, ValueError, RecursionError, OverflowError) as error:
-        return BagMetadata(damage=" ".join(str(error).split()))
-    information = _table(_table(document).get("rosbag2_bagfile_information"))
-    names = information.get("relative_file_paths")
-    counts = dict(_counts(information.get("topics_with_message_count")))
+        lines = path.read_bytes().decode("utf-8", "replace").splitlines()
+    except OSError as error:
+        return BagMetadata(damage=error.strerror or str(error))
     # Bags of the first versions name files with their folder.
-    listed = [Path(name).name for name in names if isinstance(name, str)] if isinstance(names, list) else []
-    return BagMetadata(listed, counts)
+    names = [Path(_plain(item)).name for item in _items(lines, "relative_file_paths")]
+    counts = {}
+    for item in _items(lines, "topics_with_message_count"):
+        name, count = _NAME.search(item), _COUNT.search(item)
+        if name and count:
+            counts[_plain(name[1])] = int(count[1])
+    return BagMetadata(names, counts)
 
 
-def _counts(topics: object) -> Iterator[tuple[str, int]]:
-    for entry in topics if isinstance(topics, list) else []:
-        name = _table(_table(entry).get("topic_metadata")).get("name")
-        count = _table(entry).get("message_count")
-        if isinstance(name, str) and isinstance(count, int):
-            yield name, count
+def _items(lines: list[str], key: str) -> list[str]:
+    """The items of the block list under a key: the lines of each, without its dash."""
+    found: list[list[str]] = []
+    start = next((number for number, line in enumerate(lines) if line.strip() == f"{key}:"), len(lines))
+    outer, inner = _indent(lines[start]) if start < len(lines) else 0, -1
+    for line in lines[start + 1 :]:
+        if not line.strip():
+            continue
+        dashed, indent = line.lstrip().startswith("- "), _indent(line)
+        if indent < outer or (indent == outer and not dashed):
+            break
+        if dashed and inner in (-1, indent):
+            inner = indent
+            found.append([line.lstrip()[2:]])
+        elif found:
+            found[-1].append(line)
+    return ["\n".join(item) for item in found]
 
 
-def _table(value: object) -> dict[object, object]:
-    return value if isinstance(value, dict) else {}
+def _indent(line: str) -> int:
+    return len(line) - len(line.lstrip())
+
+
+def _plain(text: str) -> str:
+    """A scalar without its quotes."""
+    stripped = text.strip()
+    return stripped[1:-1] if len(stripped) > 1 and stripped[0] == stripped[-1] and stripped[0] in "'\"" else stripped
