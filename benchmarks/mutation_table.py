@@ -119,9 +119,9 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("logs.mcap.chunks", "", "_PIECE_BYTES = 1 << 20", "20 → 22"): _AT_A_TIME,
     ("logs.mcap.chunks", "", "_FED_BYTES = 1 << 16", "1 → 2"): _AT_A_TIME,
     ("logs.mcap.chunks", "", "_FED_BYTES = 1 << 16", "16 → 17"): _AT_A_TIME,
-    ("logs.mcap.chunks", "_lz4", "content, filled, position = bytearray(size + 1), 0, 0", "1 → 2"): _ROOM,
-    ("logs.mcap.chunks", "_lz4", "content, filled, position = bytearray(size + 1), 0, 0", "+ → -"): _ROOM,
-    ("logs.mcap.chunks", "_lz4", "content[filled : filled + len(piece)] = piece", "+ → -"): _ROOM,
+    ("logs.mcap.chunks", "unpack_lz4", "content, filled, position = bytearray(size + 1), 0, 0", "1 → 2"): _ROOM,
+    ("logs.mcap.chunks", "unpack_lz4", "content, filled, position = bytearray(size + 1), 0, 0", "+ → -"): _ROOM,
+    ("logs.mcap.chunks", "unpack_lz4", "content[filled : filled + len(piece)] = piece", "+ → -"): _ROOM,
     ("logs.mcap.chunks", "_hinted", "room = data.size - HEAD_BYTES - MESSAGE_HEAD_BYTES", "- → +"): _REFUSED_NEXT,
     (
         "logs.mcap.chunks",

@@ -25,6 +25,8 @@ class ReasonCode(StrEnum):
     """The operating system refuses to read it."""
     NOT_TEXT = "not_text"
     """No text where text was expected."""
+    NOT_BAG = "not_bag"
+    """Not a ROS bag, or none whose topics can be found."""
     NOT_MCAP = "not_mcap"
     """No MCAP file, though its name says so."""
     NOT_AN_AUTOPILOT_LOG = "not_an_autopilot_log"

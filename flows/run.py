@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from fieldcal.batch.documents import NightDocument, PlanDocument, PlannedLog
+from fieldcal.batch.documents import NightDocument, PlanDocument, PlannedLog, UnreadEntry
 from fieldcal.config.find import configuration_of, find_source
 from fieldcal.flows.server import running_server
 from fieldcal.warehouse.layout import prepare
@@ -77,4 +77,6 @@ def dry_run(archive: Path, root: Path, config: Path | None, session: Path | None
         }
         for job in sorted([*plan.jobs, *plan.copied], key=lambda job: job.log_uri)
     ]
-    return {"dry_run": True, "stages_to_run": sum(len(log["would_run"]) for log in logs), "logs": logs}
+    unread: list[UnreadEntry] = [{"path": one.path, "why": one.why} for one in plan.unread]
+    to_run = sum(len(log["would_run"]) for log in logs)
+    return {"dry_run": True, "stages_to_run": to_run, "unread": unread, "logs": logs}

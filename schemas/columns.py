@@ -166,7 +166,7 @@ LOG_URI = Column("log_uri", _TEXT, "", "path of the log relative to the archive"
 LOG_SHA256 = Column(
     "log_sha256", _TEXT, "", "sha256 of the log's content (folder of CSVs: over its files' names and hashes)"
 )
-LOG_FORMAT = Column("log_format", _TEXT, "", "format of the log: mcap, csv, ulog, dataflash")
+LOG_FORMAT = Column("log_format", _TEXT, "", "format of the log: mcap, csv, ulog, dataflash, rosbag1, rosbag2")
 DURATION_S = Column("duration_s", _F64, "s", "last less first IMU time stamp")
 IMU_RATE_HZ = Column("imu_rate_hz", _F64, "Hz", "median rate of the IMU samples")
 VPS_RATE_HZ = Column("vps_rate_hz", _F64, "Hz", "median rate of the VPS poses; null without VPS")

@@ -71,11 +71,19 @@ class NightSummary(TypedDict):
     logs: list[LogEntry]
 
 
+class UnreadEntry(TypedDict):
+    """A file or folder of the archive that is no log, and why."""
+
+    path: str
+    why: str
+
+
 class NightDocument(NightSummary):
     """What `nightly --json` prints. `seconds` the whole duration, `server_seconds` what Prefect took of it."""
 
     changes: list[PlainChange]
     report: str
+    unread: list[UnreadEntry]
     seconds: NotRequired[float]
     server_seconds: NotRequired[float]
 
@@ -94,4 +102,5 @@ class PlanDocument(TypedDict):
 
     dry_run: bool
     stages_to_run: int
+    unread: list[UnreadEntry]
     logs: list[PlannedLog]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Protocol, cast
 
@@ -57,7 +57,8 @@ class Night:
         """The JSON of the night, without how long it took."""
         changes = [change.row() for change in closing.changes]
         told: dict[str, object] = dict(summary(outcomes, self.plan.copies, self.plan.copied, self.root))
-        return cast(NightDocument, {**told, "changes": changes, "report": str(closing.report)})
+        unread = [asdict(one) for one in self.plan.unread]
+        return cast(NightDocument, {**told, "changes": changes, "report": str(closing.report), "unread": unread})
 
 
 def plan_night(archive: Path, root: Path, config: Path | None = None, session: Path | None = None) -> Night:

@@ -11,6 +11,7 @@ from fieldcal.batch.steps import FlightWork
 from fieldcal.config.configuration import Configuration
 from fieldcal.flight.job import Job
 from fieldcal.flight.record import Record
+from fieldcal.logs.unread import Unread, find_unread
 from fieldcal.warehouse import Warehouse
 
 
@@ -19,7 +20,7 @@ class Plan:
     """A night before it runs.
 
     `unchanged`: flights all of whose results are there, with their records; `missing`: flights with steps to run, each
-    with why; `copies`: log_uri → log_uri of the log it is a copy of.
+    with why; `copies`: log_uri → log_uri of the log it is a copy of; `unread`: what lies beside the logs.
     """
 
     jobs: list[Job] = field(default_factory=list)
@@ -27,13 +28,15 @@ class Plan:
     missing: dict[str, dict[str, str]] = field(default_factory=dict)
     copies: dict[str, str] = field(default_factory=dict)
     copied: list[Job] = field(default_factory=list)
+    unread: list[Unread] = field(default_factory=list)
 
 
 def make_plan(root: Path, archive: Path, configuration: Configuration, session: Path | None = None) -> Plan:
     """Find the logs and decide for each which steps must run."""
     found = find_jobs(archive, configuration, session, read_ledger(root))
     kept, copies = without_copies(found, *_known(root, archive))
-    plan = Plan(copies=copies, copied=[job for job in found if job.log_uri in copies])
+    unread = find_unread(archive, {job.log_uri for job in found}, session)
+    plan = Plan(copies=copies, copied=[job for job in found if job.log_uri in copies], unread=unread)
     for job in kept:
         work = FlightWork(root, job, configuration.vehicle(job.vehicle_id))
         pending = work.pending()

@@ -16,9 +16,13 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 import fieldcal
+from fieldcal.config.find import configuration_of, find_source
+from fieldcal.errors import FieldcalError
 from fieldcal.flows.alive import FOLDER as RUNNING
 from fieldcal.flows.alive import dead, is_held
 from fieldcal.flows.server import answers, no_answer, serving_address
+from fieldcal.logs import find_logs
+from fieldcal.logs.unread import find_unread, told
 
 OK, WARNING, FAILED = "ok", "warning", "failed"
 LEAST_FREE_BYTES = 200 << 20
@@ -45,12 +49,12 @@ class Examination:
     checks: list[Check]
 
 
-def examine(root: Path, archive: Path | None = None) -> Examination:
+def examine(root: Path, archive: Path | None = None, config: Path | None = None) -> Examination:
     """Look at everything."""
     checks = [
         *_versions(),
         *_root(root),
-        *([] if archive is None else [_archive(archive)]),
+        *([] if archive is None else [_archive(archive, config)]),
         *_disk(root),
         _open_files(),
         *_locks(root),
@@ -115,14 +119,22 @@ def _writable(folder: Path) -> Check:
     return Check("permissions", OK, f"{folder} can be written")
 
 
-def _archive(archive: Path) -> Check:
+def _archive(archive: Path, config: Path | None) -> Check:
     if not archive.is_dir():
         return Check("archive", FAILED, f"there is no folder {archive}", "Mount it, or correct the path.")
     unreadable = [path for path in sorted(archive.rglob("*")) if not path.is_symlink() and not os.access(path, os.R_OK)]
     if unreadable:
         found = f"{len(unreadable)} of its files cannot be read, the first is {unreadable[0]}"
         return Check("archive", WARNING, found, "Give this user the right to read them.")
-    return Check("archive", OK, str(archive))
+    try:
+        mapped = configuration_of(find_source(config, archive)).logs
+    except FieldcalError as error:
+        return Check("archive", WARNING, f"{archive}: {error.sentence}", "Correct the configuration.")
+    logs = find_logs(archive, mapped)
+    if unread := find_unread(archive, {log.log_uri for log in logs}):
+        advice = "Convert them, name them in archive.logs, or move them out."
+        return Check("archive", WARNING, f"{archive}: {len(logs)} logs; {told(unread)}", advice)
+    return Check("archive", OK, f"{archive}: {len(logs)} logs")
 
 
 def _disk(root: Path) -> Iterator[Check]:

@@ -247,14 +247,14 @@ def doctor(
     Parameters
     ----------
     archive
-        Check that the logs of this archive can be read too.
+        Check that the logs of this archive can be read too, and name what is no log.
     """
     from dataclasses import asdict
 
     from fieldcal.cli.doctor import examine
     from fieldcal.cli.show import print_json
 
-    result = examine(_root(warehouse), archive)
+    result = examine(_root(warehouse), archive, config)
     if as_json:
         print_json(asdict(result))
     else:

@@ -7,9 +7,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from fieldcal.batch.documents import LogEntry, NightDocument, PlanDocument, PlannedLog
+from fieldcal.batch.documents import LogEntry, NightDocument, PlanDocument, PlannedLog, UnreadEntry
 from fieldcal.batch.outcome import cause, verdict_counts
 from fieldcal.cli.show import table
+from fieldcal.logs.unread import Unread, told
 from fieldcal.names import Verdict
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.flights import is_consequence
@@ -25,6 +26,7 @@ def print_night(console: Console, result: NightDocument, root: Path) -> None:
     counts = verdict_counts(result)
     work = f"{result['stages_run']} stages run, {result['stages_cached']} from the cache, {result['seconds']:.1f} s"
     console.print(f"{len(result['logs'])} logs: {counts}; {work}", markup=False)
+    print_unread(console, result["unread"])
     troubled = [log for log in result["logs"] if log["verdict"] != Verdict.OK or log["reason_code"]]
     if troubled:
         lines = [[log["log_uri"], log["verdict"], log["reason"] or ""] for log in troubled]
@@ -62,9 +64,16 @@ def print_plan(console: Console, plan: PlanDocument) -> None:
     console.print(
         f"{len(plan['logs'])} logs; {plan['stages_to_run']} stages would run. Nothing was changed.", markup=False
     )
+    print_unread(console, plan["unread"])
     lines = [[log["log_uri"], _would(log)] for log in plan["logs"] if log["would_run"] or log["copy_of"]]
     if lines:
         console.print(table(["log", "would run"], lines))
+
+
+def print_unread(console: Console, unread: Sequence[UnreadEntry]) -> None:
+    """A line on what lies beside the logs, where there is something."""
+    if unread:
+        console.print(told([Unread(**entry) for entry in unread]), markup=False)
 
 
 def _would(log: PlannedLog) -> str:

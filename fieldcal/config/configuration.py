@@ -126,11 +126,15 @@ def _keys(table: object) -> Mapping[str, object]:
 
 
 class McapMap(Table):
-    """Topics and fields of a vehicle's MCAP logs where message types alone do not decide."""
+    """Topics and fields of a vehicle's MCAP and ROS logs where message types alone do not decide."""
 
     imu: Text | None = None
     magnetometer: Text | None = None
     vps: Text | None = None
+    vps_frame: Annotated[
+        Text | None, _meaning("the vehicle's frame among transforms (/tf): its pose is the VPS; a child frame")
+    ] = None
+    vps_parent_frame: Annotated[Text | None, _meaning("the frame that vps_frame is given in, where several are")] = None
     temperature: Text | None = None
     power: Text | None = None
     position: Text | None = None

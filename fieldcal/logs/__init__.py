@@ -28,6 +28,8 @@ from fieldcal.logs.interface import (
     LogSummary,
 )
 from fieldcal.logs.mcap.reader import McapLog
+from fieldcal.logs.rosbag1.reader import Rosbag1Log
+from fieldcal.logs.rosbag2.reader import Rosbag2Log
 from fieldcal.logs.ulog.reader import UlogLog
 from fieldcal.reason_codes import ReasonCode
 
@@ -36,6 +38,8 @@ READERS: dict[str, Callable[[Path, Vehicle], LogReader]] = {
     "csv": CsvLog,
     "ulog": UlogLog,
     "dataflash": DataflashLog,
+    "rosbag1": Rosbag1Log,
+    "rosbag2": Rosbag2Log,
 }
 """Log format (as `discovery.log_format` names it) -> reader."""
 
@@ -46,7 +50,8 @@ def open_log(path: Path, vehicle: Vehicle) -> LogReader:
     Parameters
     ----------
     path : Path
-        An `.mcap`, `.ulg`, `.bin` (ArduPilot) or `.csv` file, or a folder with `imu.csv`.
+        An `.mcap`, `.mcap.zstd`, `.bag`, `.db3`, `.ulg`, `.bin` (ArduPilot) or `.csv` file, a rosbag2 folder, or a
+        folder with `imu.csv`.
     vehicle : Vehicle
         Configuration of its vehicle: topics, columns, units.
 
@@ -59,7 +64,7 @@ def open_log(path: Path, vehicle: Vehicle) -> LogReader:
         raise UnreadableLog(ReasonCode.NOT_FOUND, f"{path.name} does not exist. Check the path.")
     kind = log_format(path)
     if kind not in READERS:
-        what = f"a {path.suffix or 'folder without imu.csv'}"
+        what = "a folder that is neither a ROS 2 bag nor has imu.csv" if path.is_dir() else f"a {path.suffix or 'file'}"
         raise UnreadableLog(
             ReasonCode.FORMAT_NOT_SUPPORTED,
             f"{path.name} is {what}, which cannot be read. Convert it to MCAP or CSV.",
@@ -104,6 +109,8 @@ __all__ = [
     "LogReader",
     "LogSummary",
     "McapLog",
+    "Rosbag1Log",
+    "Rosbag2Log",
     "UlogLog",
     "batch_frame",
     "find_logs",

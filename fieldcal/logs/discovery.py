@@ -9,9 +9,27 @@ from pathlib import Path
 from typing import Protocol
 
 from fieldcal.logs.interface import LogFile
+from fieldcal.logs.rosbag2.parts import bag_files, is_bag_folder
 
-LOG_FORMATS = {".mcap": "mcap", ".csv": "csv", ".ulg": "ulog", ".bin": "dataflash"}
-FOLDER_FORMAT = "csv"
+LOG_FORMATS = {
+    ".mcap": "mcap",
+    ".mcap.zstd": "mcap",
+    ".mcap.zst": "mcap",
+    ".csv": "csv",
+    ".ulg": "ulog",
+    ".bin": "dataflash",
+    ".bag": "rosbag1",
+    ".bag.active": "rosbag1",
+    ".db3": "rosbag2",
+    ".db3.zstd": "rosbag2",
+    ".db3.zst": "rosbag2",
+}
+"""End of a log's name → its format."""
+
+TABLE_ENDS = (".tsv", ".txt")
+"""Ends of names of tables that are read as csv where somebody names them, by a glob with that end or one by one."""
+
+CSV_FOLDER, BAG_FOLDER = "csv", "rosbag2"
 _READ_BYTES = 1 << 20
 
 
@@ -27,16 +45,25 @@ class LogsEntry(Protocol):
 
 
 def log_format(path: Path) -> str | None:
-    """The format that a path's name promises (a folder with `imu.csv` counts as csv), or None when it is no log."""
+    """The format that a path's name promises, or None when it is no log.
+
+    A folder with `imu.csv` counts as csv, one with the files of a ROS 2 bag as rosbag2.
+    """
     if path.is_dir():
-        return FOLDER_FORMAT if (path / "imu.csv").is_file() else None
-    return LOG_FORMATS.get(path.suffix.lower())
+        if (path / "imu.csv").is_file():
+            return CSV_FOLDER
+        return BAG_FOLDER if is_bag_folder(path) else None
+    name = path.name.lower()
+    if name.endswith(TABLE_ENDS):
+        return "csv"
+    return next((kind for end, kind in LOG_FORMATS.items() if name.endswith(end)), None)
 
 
 def log_sha256(path: Path) -> str:
     """sha256 of a log's content, in hexadecimal.
 
-    A file: of its bytes. A folder: of one line "name NUL sha256" for each of its CSV files, sorted by name.
+    A file: of its bytes. A folder: of one line "name NUL sha256" for each of its CSV files, or of the files of its bag,
+    sorted by name.
     """
     if not path.is_dir():
         return _file_sha256(path)
@@ -47,7 +74,9 @@ def log_sha256(path: Path) -> str:
 
 
 def folder_parts(folder: Path) -> list[Path]:
-    """The CSV files of a log folder."""
+    """The files of a log folder that are its content: CSV files, or those of a ROS 2 bag."""
+    if log_format(folder) == BAG_FOLDER:
+        return bag_files(folder)
     return [part for part in folder.iterdir() if part.suffix.lower() == ".csv" and part.is_file()]
 
 
@@ -70,49 +99,67 @@ def find_logs(archive: Path, logs_map: Iterable[LogsEntry] | None = None) -> lis
 
     Notes
     -----
-    Hidden names are skipped. Links are followed only while they stay inside the archive, those of a folder's files too.
+    A session's folder that is a ROS 2 bag is the one log of its session. Hidden names are skipped.
+    Links are followed only while they stay inside the archive, those of a folder's files too.
     """
     root = archive.resolve()
     found: dict[str, LogFile] = {}
     for entry in logs_map or ():
         for path in sorted(archive.glob(entry.glob)):
+            if path.suffix.lower() in TABLE_ENDS and not entry.glob.lower().endswith(path.suffix.lower()):
+                continue
             folders = path.relative_to(archive).parts[:-1] or (path.stem,)
             _add(found, archive, root, path, entry.vehicle or folders[0], entry.session or folders[-1])
     for vehicle in _folders(archive, root):
         for session in _folders(vehicle, root):
-            if log_format(session) is not None and session.relative_to(archive).as_posix() in found:
+            kind = _format_or_none(session)
+            if kind is not None and session.relative_to(archive).as_posix() in found:
                 continue
-            for path in _entries(session):
+            if kind == BAG_FOLDER:  # its files are no flights of their own
+                _add(found, archive, root, session, vehicle.name, session.name)
+                continue
+            for path in entries(session):
+                if path.suffix.lower() in TABLE_ENDS:
+                    continue
                 _add(found, archive, root, path, vehicle.name, session.name)
     return sorted(found.values(), key=lambda log: log.log_uri)
 
 
 def _add(found: dict[str, LogFile], archive: Path, root: Path, path: Path, vehicle: str, session: str) -> None:
-    if not _inside(path, root):
+    if not inside(path, root):
         return
     try:
         kind = log_format(path)
-        if kind is not None and path.is_dir() and not all(_inside(part, root) for part in folder_parts(path)):
+        if kind is not None and path.is_dir() and not all(inside(part, root) for part in folder_parts(path)):
             return
     except OSError:  # a folder that may not be entered: whoever reads it will say so
-        kind = FOLDER_FORMAT
+        kind = CSV_FOLDER
     log_uri = path.relative_to(archive).as_posix()
     if kind is not None and log_uri not in found:
         found[log_uri] = LogFile(path, log_uri, vehicle, session, kind)
 
 
+def _format_or_none(path: Path) -> str | None:
+    try:
+        return log_format(path)
+    except OSError:  # a folder that may not be entered
+        return None
+
+
 def _folders(folder: Path, root: Path) -> Iterator[Path]:
-    return (path for path in _entries(folder) if _inside(path, root) and path.is_dir())
+    return (path for path in entries(folder) if inside(path, root) and path.is_dir())
 
 
-def _entries(folder: Path) -> list[Path]:
+def entries(folder: Path) -> list[Path]:
+    """What a folder holds, sorted; without hidden names, nothing where it may not be entered."""
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError:
         return []
 
 
-def _inside(path: Path, root: Path) -> bool:
+def inside(path: Path, root: Path) -> bool:
+    """Whether a path exists and does not lead out of the resolved folder `root`."""
     try:
         return path.resolve(strict=True).is_relative_to(root)
     except (OSError, RuntimeError):

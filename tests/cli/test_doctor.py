@@ -103,3 +103,12 @@ def test_a_server_that_answers(tmp_path: Path, prefect_server: str, monkeypatch:
 def test_an_archive_that_is_not_there(tmp_path: Path) -> None:
     assert checks(tmp_path, tmp_path / "none")["archive"].status == "failed"
     assert checks(tmp_path, tmp_path)["archive"].status == "ok"
+
+
+def test_an_archive_with_what_is_no_log(tmp_path: Path) -> None:
+    session = tmp_path / "a" / "s"
+    session.mkdir(parents=True)
+    (session / "flight.dat").write_text("x")
+    found = checks(tmp_path / "root", tmp_path)["archive"]
+    assert found.status == "warning"
+    assert "a/s/flight.dat (no known kind of log)" in found.found

@@ -301,6 +301,7 @@ def test_a_dry_run_changes_nothing(archive: Path, warehouse: Path, tmp_path: Pat
     shutil.rmtree(warehouse / "stages" / "verify")
     before = file_hashes(warehouse)
     plan = dry_run(archive, warehouse, None, None)
+    assert plan["unread"] == []
     would_run = {"verify": "no result yet", "choice": "new input: verify", "composition": "new input: choice"}
     assert [log["would_run"] for log in plan["logs"]] == [would_run] * 2
     assert file_hashes(warehouse) == before

@@ -50,7 +50,7 @@ def test_logs_are_listed_in_order_with_vehicle_and_session(archive: Path) -> Non
 
 
 def test_the_column_names_the_formats_that_discovery_gives() -> None:
-    assert LOG_FORMAT.meaning.split(": ")[1].split(", ") == list(LOG_FORMATS.values())
+    assert LOG_FORMAT.meaning.split(": ")[1].split(", ") == list(dict.fromkeys(LOG_FORMATS.values()))
 
 
 def test_links_out_of_the_archive_and_loops_are_not_followed(archive: Path, tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_the_hash_is_of_the_content_not_of_the_place(archive: Path, tmp_path: Pa
 
 @pytest.mark.parametrize(
     ("name", "code"),
-    [("f.db", "format_not_supported"), ("f.txt", "format_not_supported")],
+    [("f.db", "format_not_supported"), ("f.dat", "format_not_supported")],
 )
 def test_formats_that_are_not_read(tmp_path: Path, name: str, code: str) -> None:
     with pytest.raises(UnreadableLog, match="Convert it") as caught:

@@ -10,10 +10,11 @@ import pytest
 from mcap import records as written
 from mcap.data_stream import RecordBuilder
 
+from fieldcal.logs.encodings.gather import gather
 from fieldcal.logs.mcap import records
 from fieldcal.logs.mcap.records import Damage, Fields
-from fieldcal.logs.mcap.report import Definitions
 from fieldcal.logs.mcap.summary import ends_whole, read_summary
+from fieldcal.logs.messages.definitions import Definitions
 
 HEAD = 1 + 8
 FOOTER = HEAD + 8 + 8 + 4
@@ -189,13 +190,13 @@ def test_gathered_values_are_those_at_the_offsets_up_to_the_last_byte(code: str,
     dtype = np.dtype(code)
     size = dtype.itemsize * count
     offsets = np.array([64 - size, 0, 7, 7])
-    found = records.gather(data, offsets, dtype, count)
+    found = gather(data, offsets, dtype, count)
     expected = np.array([np.frombuffer(data[o : o + size].tobytes(), dtype) for o in offsets])
     np.testing.assert_array_equal(found, expected if count > 1 else expected[:, 0])
     assert found.shape == ((4, count) if count > 1 else (4,))
-    assert records.gather(data, offsets[:0], dtype, count).shape == ((0, count) if count > 1 else (0,))
+    assert gather(data, offsets[:0], dtype, count).shape == ((0, count) if count > 1 else (0,))
     with pytest.raises(IndexError):
-        records.gather(data, offsets + 1, dtype, count)
+        gather(data, offsets + 1, dtype, count)
 
 
 # summary -------------------------------------------------------------------------------------------------------------

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from fieldcal.logs.interface import LogSummary
 from fieldcal.logs.mcap import records
-from fieldcal.logs.mcap.report import Definitions, Tally, report
+from fieldcal.logs.mcap.report import Tally, report
+from fieldcal.logs.messages.definitions import Definitions
 
 TOPICS = Definitions(channels={i: records.Channel(i, 0, f"/t{i}", "cdr", ()) for i in range(1, 13)})
 Told = list[tuple[str, int, bool, bool]]

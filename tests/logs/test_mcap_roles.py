@@ -7,9 +7,9 @@ import pytest
 from fieldcal.config.configuration import McapMap
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.interface import LogSummary
-from fieldcal.logs.mcap.records import Channel, Schema
-from fieldcal.logs.mcap.report import Definitions
-from fieldcal.logs.mcap.roles import Source, choose_sources
+from fieldcal.logs.messages.definitions import Channel, Definitions, Schema
+from fieldcal.logs.messages.roles import choose_sources
+from fieldcal.logs.messages.source import Source
 
 
 def definitions(topics: dict[str, str], text: str = "float64 x") -> Definitions:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from bags import Truth, write_rosbag1, write_rosbag2
 from dataflash_support import DataflashFlight
 
 from fieldcal.config.configuration import Vehicle, load, parse
@@ -34,10 +35,22 @@ def write_dataflash_flight(archive: Path) -> None:
     (archive / "fieldcal.toml").write_text("")
 
 
+def write_bag(archive: Path, log_format: str) -> None:
+    truth = Truth(50, ros1=log_format == "rosbag1")
+    (archive / "v" / "s").mkdir(parents=True)
+    if log_format == "rosbag1":
+        write_rosbag1(archive / "v" / "s" / "a.bag", truth.messages, truth.rows)
+    else:
+        write_rosbag2(archive / "v" / "s" / "a", truth.messages, truth.rows)
+    (archive / "fieldcal.toml").write_text("")
+
+
 @pytest.mark.parametrize("log_format", READERS)
 def test_a_reader_reads_nothing_that_its_key_does_not_hold(tmp_path: Path, log_format: str) -> None:
     if log_format == "dataflash":
         write_dataflash_flight(tmp_path)
+    elif log_format.startswith("rosbag"):
+        write_bag(tmp_path, log_format)
     else:
         write_flights(tmp_path, Experiment(duration_s=5.0), log_format=log_format)
     (log,) = find_logs(tmp_path)

@@ -47,12 +47,14 @@ class Decoded:
     """Decoded messages.
 
     `values`: name -> float64, shape (n,) or (n, width). `stamp_ns`: int64 (n,), or None when messages carry no stamp.
-    `kept`: the positions, among the messages handed in, of the n that could be decoded.
+    `kept`: the positions, among the messages handed in, of the n that could be decoded. `malformed`: how many could
+    not, where that is not the rest.
     """
 
     values: dict[str, NDArray[np.float64]]
     stamp_ns: NDArray[np.int64] | None
     kept: NDArray[np.intp]
+    malformed: int | None = None
 
 
 class Decoder(Protocol):

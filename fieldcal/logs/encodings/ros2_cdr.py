@@ -24,6 +24,7 @@ from fieldcal.logs.encodings.decoded import (
     UnsupportedSchema,
     Want,
 )
+from fieldcal.logs.encodings.gather import gather
 from fieldcal.logs.encodings.ros2_definitions import (
     BUILTIN,
     DefinitionError,
@@ -36,10 +37,9 @@ from fieldcal.logs.encodings.ros2_definitions import (
     full_text,
     short_name,
 )
-from fieldcal.logs.mcap.records import gather
 
 ENCAPSULATION_BYTES = 4
-_ENCAPSULATIONS = {0x0000: (">", 8), 0x0100: ("<", 8), 0x0600: (">", 4), 0x0700: ("<", 4)}
+ENCAPSULATIONS = {0x0000: (">", 8), 0x0100: ("<", 8), 0x0600: (">", 4), 0x0700: ("<", 4)}
 """First two bytes (as a little-endian number) -> byte order and largest alignment: CDR, and plain XCDR2."""
 
 Cursor = int | NDArray[np.int64]
@@ -116,9 +116,9 @@ class CdrDecoder:
         kept = np.flatnonzero(sizes >= ENCAPSULATION_BYTES)
         kinds = gather(data, starts[kept], np.dtype("<u2"))
         parts = [
-            self._decode_kind(data, starts, sizes, kept[kinds == kind], *_ENCAPSULATIONS[kind])
+            self._decode_kind(data, starts, sizes, kept[kinds == kind], *ENCAPSULATIONS[kind])
             for kind in np.unique(kinds).tolist()
-            if kind in _ENCAPSULATIONS
+            if kind in ENCAPSULATIONS
         ]
         if len(parts) == 1:
             return parts[0]

@@ -12,6 +12,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from fieldcal.logs.encodings.gather import gather
 from fieldcal.logs.mcap.records import (
     HEAD_BYTES,
     MESSAGE,
@@ -22,7 +23,6 @@ from fieldcal.logs.mcap.records import (
     Fields,
     Record,
     check_first_record,
-    gather,
     read_chunk_head,
     read_record,
 )
@@ -101,7 +101,7 @@ def decompress(buffer: Buffer, head: ChunkHead) -> bytes | memoryview:
         if head.compression == "zstd":
             content = _zstd(packed, size)
         elif head.compression == "lz4":
-            content = _lz4(packed, size)
+            content = unpack_lz4(packed, size)
         else:
             content = packed
     except (zstandard.ZstdError, RuntimeError, ValueError, MemoryError) as error:
@@ -125,8 +125,11 @@ def _zstd(packed: memoryview, size: int) -> bytes | memoryview:
     return memoryview(content)[:filled]
 
 
-def _lz4(packed: memoryview, size: int) -> memoryview:
-    """All frames, fed in pieces: the decompressor copies what it is fed and does not use."""
+def unpack_lz4(packed: memoryview, size: int) -> memoryview:
+    """At most `size` + 1 bytes of all frames, fed in pieces: the decompressor copies what it is fed and does not use.
+
+    Raises RuntimeError, ValueError.
+    """
     content, filled, position = bytearray(size + 1), 0, 0
     frame = lz4.frame.LZ4FrameDecompressor()
     rest = b""

@@ -10,13 +10,13 @@ from __future__ import annotations
 import mmap
 import zlib
 from collections.abc import Generator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fieldcal.errors import UnreadableLog
+from fieldcal.logs.encodings.gather import gather
 from fieldcal.logs.mcap.chunks import ChunkOpener, locate_messages
 from fieldcal.logs.mcap.mapped import map_file
 from fieldcal.logs.mcap.records import (
@@ -31,6 +31,7 @@ from fieldcal.logs.mcap.records import (
     HEADER,
     MAGIC,
     MESSAGE,
+    MESSAGE_HEAD_BYTES,
     MESSAGE_INDEX,
     METADATA,
     SCHEMA,
@@ -39,34 +40,25 @@ from fieldcal.logs.mcap.records import (
     Record,
     Statistics,
     check_record,
-    gather,
     read_channel,
     read_message_index,
     read_metadata,
     read_record,
     read_schema,
 )
-from fieldcal.logs.mcap.report import Definitions, Tally
+from fieldcal.logs.mcap.report import Tally
 from fieldcal.logs.mcap.search import Search
 from fieldcal.logs.mcap.summary import ends_whole, read_summary
+from fieldcal.logs.messages.container import Block
+from fieldcal.logs.messages.definitions import Definitions
 from fieldcal.reason_codes import ReasonCode
 
 MESSAGES_AT_ONCE = 1 << 16
 LOOSE_BYTES = 4 << 20
 RELEASE_BYTES = 64 << 20
 _CRC_PIECE_BYTES = 16 << 20
-
-
-@dataclass(frozen=True)
-class Block:
-    """Messages to be decoded together: `starts` are the byte offsets of their records in `data`, in file order.
-
-    `verified`: `data` was under a CRC that held.
-    """
-
-    data: NDArray[np.uint8]
-    starts: NDArray[np.int64]
-    verified: bool
+_LOG_TIME_PLACE = 6
+_U2, _U8 = np.dtype("<u2"), np.dtype("<u8")
 
 
 class McapFile:
@@ -76,6 +68,8 @@ class McapFile:
     ----------
     path : Path
         The file.
+    buffer : mmap, optional
+        Its content, where it is mapped already.
 
     Raises
     ------
@@ -83,9 +77,9 @@ class McapFile:
         `empty_file`, `not_mcap`, `not_readable`.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, buffer: mmap.mmap | None = None) -> None:
         self.name = path.name
-        self.buffer = map_file(path)
+        self.buffer = map_file(path) if buffer is None else buffer
         self.size = len(self.buffer)
         self.definitions = Definitions()
         self.metadata: dict[str, dict[str, str]] = {}
@@ -291,8 +285,11 @@ class McapFile:
     def _slices(self, data: NDArray[np.uint8], starts: NDArray[np.int64], verified: bool) -> Generator[Block]:
         for first in range(0, len(starts), MESSAGES_AT_ONCE):
             some = starts[first : first + MESSAGES_AT_ONCE]
-            channels, counts = np.unique(gather(data, some + HEAD_BYTES, np.dtype("<u2")), return_counts=True)
+            of_messages = gather(data, some + HEAD_BYTES, _U2).astype(np.int64)
+            channels, counts = np.unique(of_messages, return_counts=True)
             for channel_id, count in zip(channels.tolist(), counts.tolist(), strict=True):
                 known = channel_id in self.definitions.channels
                 (self.tally.messages if known else self.tally.unknown_channels)[channel_id] += count
-            yield Block(data, some, verified)
+            log_time_ns = gather(data, some + HEAD_BYTES + _LOG_TIME_PLACE, _U8).view(np.int64)
+            sizes = gather(data, some + 1, _U8).view(np.int64) - MESSAGE_HEAD_BYTES
+            yield Block(data, some + HEAD_BYTES + MESSAGE_HEAD_BYTES, sizes, of_messages, log_time_ns, verified)

@@ -13,6 +13,8 @@ from mmap import mmap
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldcal.logs.messages.definitions import Channel, Schema
+
 Buffer = bytes | memoryview | mmap
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -42,27 +44,6 @@ class Record:
     start: int
     body: int
     end: int
-
-
-@dataclass(frozen=True)
-class Schema:
-    """How the messages of some channels are laid out."""
-
-    schema_id: int
-    name: str
-    encoding: str
-    data: bytes
-
-
-@dataclass(frozen=True)
-class Channel:
-    """One stream of messages. `schema_id` 0: no schema."""
-
-    channel_id: int
-    schema_id: int
-    topic: str
-    message_encoding: str
-    metadata: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True)
@@ -272,18 +253,3 @@ def check_first_record(buffer: Buffer, head: ChunkHead) -> None:
     record = read_record(buffer, head.start, head.end)
     if record.opcode not in (SCHEMA, CHANNEL, MESSAGE) and record.opcode < FIRST_PRIVATE_OPCODE:
         raise Damage(f"record {record.opcode:#04x} does not belong into a chunk")
-
-
-def gather(data: NDArray[np.uint8], offsets: NDArray[np.int64], dtype: np.dtype, count: int = 1) -> NDArray:  # type: ignore[type-arg]
-    """Values of `dtype` lying at byte `offsets` of `data`: shape (n,), or (n, count) when `count` > 1.
-
-    The caller has checked that every offset leaves room for the value.
-    """
-    size = dtype.itemsize * count
-    if not offsets.size:
-        return np.empty((0, count) if count > 1 else 0, dtype)
-    windows: NDArray[np.void] = np.ndarray(
-        (data.size - size + 1,), dtype=np.dtype((np.void, size)), buffer=data, strides=(1,)
-    )
-    values = windows[offsets].view(dtype)
-    return values.reshape(-1, count) if count > 1 else values

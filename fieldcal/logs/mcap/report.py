@@ -6,7 +6,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from fieldcal.logs.interface import LogSummary
-from fieldcal.logs.mcap.records import Channel, Schema, Statistics
+from fieldcal.logs.mcap.records import Statistics
+from fieldcal.logs.messages.definitions import Definitions
 from fieldcal.reason_codes import ReasonCode
 
 
@@ -30,33 +31,6 @@ class Tally:
         """Drop the last damage met: it is the end of a file that was cut, told as such."""
         places = max(self.damaged_chunks, self.damaged_records, key=lambda damage: damage[-1][0] if damage else -1)
         places.pop()
-
-
-@dataclass
-class Definitions:
-    """Schemas and channels by id. A second, different definition of an id is kept in `redefined` and not adopted."""
-
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    redefined: dict[str, None] = field(default_factory=dict)
-
-    def add(self, definition: Schema | Channel) -> None:
-        """Take a definition, identical repetitions included."""
-        if isinstance(definition, Schema):
-            known: Schema | Channel = self.schemas.setdefault(definition.schema_id, definition)
-            what = f"schema {definition.schema_id} ({definition.name})"
-        else:
-            known = self.channels.setdefault(definition.channel_id, definition)
-            what = f"channel {definition.channel_id} ({definition.topic})"
-        if known != definition:
-            self.redefined[what] = None
-
-    def by_topic(self) -> dict[str, list[Channel]]:
-        """Topic → its channels."""
-        topics: dict[str, list[Channel]] = {}
-        for channel in self.channels.values():
-            topics.setdefault(channel.topic, []).append(channel)
-        return topics
 
 
 def report(

@@ -11,7 +11,8 @@ import re
 
 from fieldcal.logs.mcap.chunks import ChunkOpener
 from fieldcal.logs.mcap.records import MESSAGE, Damage, Statistics, check_record, read_record
-from fieldcal.logs.mcap.report import Definitions, Tally
+from fieldcal.logs.mcap.report import Tally
+from fieldcal.logs.messages.definitions import Definitions
 
 _LOOSE_CHAIN = 4
 _CHUNK_PATTERN = re.compile(rb"\x06.{5}\x00{3}.{21}\x00{3}.{4}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd)", re.DOTALL)

@@ -25,7 +25,7 @@ from fieldcal.logs.mcap.records import (
     read_schema,
     read_statistics,
 )
-from fieldcal.logs.mcap.report import Definitions
+from fieldcal.logs.messages.definitions import Definitions
 
 _CRC_BYTES = 4
 _DATA_END_HEAD = bytes([DATA_END]) + (DATA_END_BYTES - HEAD_BYTES).to_bytes(8, "little")

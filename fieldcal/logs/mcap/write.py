@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fieldcal.logs.encodings.decoded import COMPONENTS, NANOSECONDS
 from fieldcal.logs.encodings.ros2_definitions import Numbers, Text, flatten, full_text
-from fieldcal.logs.mcap.roles import METADATA_NAME, RAW_IMU
+from fieldcal.logs.messages.roles import METADATA_NAME, RAW_IMU
 
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 ENCODINGS = ("cdr", "json")

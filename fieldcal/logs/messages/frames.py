@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldcal.errors import UnreadableLog
+from fieldcal.logs.encodings.gather import gather
 from fieldcal.logs.encodings.ros2_cdr import CdrDecoder
-from fieldcal.logs.mcap.records import gather
-from fieldcal.logs.mcap.roles import Source
+from fieldcal.logs.messages.source import Source
 from fieldcal.reason_codes import ReasonCode
 
 STAMPED_TYPES = ("sensor_msgs/Imu",)

@@ -1,24 +1,20 @@
-"""What the topics of an MCAP file say beyond their types: halves of an IMU, estimates that are no reference."""
+"""What the topics of a log say beyond their types: halves of an IMU, estimates that are no reference."""
 
 from __future__ import annotations
 
 from fieldcal.logs.encodings.ros2_definitions import short_name
 from fieldcal.logs.interface import LogSummary
-from fieldcal.logs.mcap.records import Channel
-from fieldcal.logs.mcap.report import Definitions
+from fieldcal.logs.messages.definitions import Channel, Definitions
 from fieldcal.reason_codes import ReasonCode
 
 IMU = "sensor_msgs/Imu"
-UNREAD_POSES = ("tf2_msgs/TFMessage", "tf/tfMessage")
-"""Types that hold poses of many frames in one topic."""
 ESTIMATES = ("local_position", "global_position", "ekf", "estimat", "filtered", "fused", "robot_pose", "localization")
 """What stands in the names of topics that carry an autopilot's own estimate: it has seen the IMU already."""
 
 
-def tell_of_references(vps: str | None, definitions: Definitions, summary: LogSummary, log_name: str) -> None:
-    """Findings on a VPS that nothing configures: its topic `vps` carries an estimate of the vehicle's own, which is not
-    used then, or there is none and transforms are not read."""
-    if vps is not None and is_estimate(vps):
+def tell_of_estimate(vps: str, summary: LogSummary, log_name: str) -> bool:
+    """Whether the topic `vps`, which nothing configures, carries an estimate of the vehicle's own; told, and not used."""
+    if is_estimate(vps):
         summary.add(
             ReasonCode.VPS_IS_ESTIMATE,
             1,
@@ -26,18 +22,8 @@ def tell_of_references(vps: str | None, definitions: Definitions, summary: LogSu
             "already: agreement with it proves nothing, and it is not used as VPS. If it is a reference, name it as "
             "mcap.vps.",
         )
-    unread = [
-        f"{topic} ({type_name_of(channels[0], definitions)})"
-        for topic, channels in sorted(definitions.by_topic().items())
-        if type_name_of(channels[0], definitions) in UNREAD_POSES
-    ]
-    if vps is None and unread:
-        summary.add(
-            ReasonCode.UNSUPPORTED_SCHEMA,
-            len(unread),
-            f"{log_name}: there is no VPS; transforms of {', '.join(unread)} are not read. Publish the vehicle's pose "
-            "as geometry_msgs/PoseStamped if it is among them.",
-        )
+        return True
+    return False
 
 
 def is_estimate(topic: str) -> bool:

@@ -1,9 +1,8 @@
-"""Which topic of an MCAP file is what: the inertial unit, the magnetometer, the VPS, temperature, current, position."""
+"""Which topic of a log is what: the inertial unit, the magnetometer, the VPS, temperature, current, position."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 from fieldcal.config.configuration import McapMap
 from fieldcal.config.values import Paths
@@ -14,9 +13,10 @@ from fieldcal.logs.encodings.protobuf_messages import ProtobufDecoder
 from fieldcal.logs.encodings.ros2_cdr import CdrDecoder, Ros1Decoder
 from fieldcal.logs.interface import LogSummary
 from fieldcal.logs.joining import INERTIAL
-from fieldcal.logs.mcap.records import Channel, Schema
-from fieldcal.logs.mcap.report import Definitions
-from fieldcal.logs.mcap.topics import imu_halves, is_estimate, tell_of_references, type_name_of
+from fieldcal.logs.messages.definitions import Channel, Definitions, Schema
+from fieldcal.logs.messages.source import Source
+from fieldcal.logs.messages.topics import imu_halves, is_estimate, tell_of_estimate, type_name_of
+from fieldcal.logs.messages.transforms import frames_of_transforms, transform_source
 from fieldcal.reason_codes import ReasonCode
 
 RAW_IMU = "fieldcal_msgs/RawImu"
@@ -68,17 +68,6 @@ OPTIONAL = ("magnetometer", "temperature", "power", "position", "vps")
 _HINTS = {"imu": ("raw",), "magnetometer": ("raw",), "vps": ("vps", "mocap", "vrpn", "optitrack", "vicon")}
 
 
-@dataclass(frozen=True)
-class Source:
-    """The topic that plays a role: its channels by id, message type, and which values it gives."""
-
-    role: str
-    topic: str
-    type_name: str
-    decoders: Mapping[int, Decoder]
-    values: tuple[str, ...]
-
-
 def choose_sources(
     definitions: Definitions,
     mapping: McapMap,
@@ -114,6 +103,9 @@ def choose_sources(
         if not configured and role == "imu" and not fields and (halves := imu_halves(definitions)):
             sources += [_half(sensor, topic, definitions) for sensor, topic in zip(INERTIAL, halves, strict=True)]
             continue
+        if role == "vps" and (transforms := transform_source(definitions, mapping, summary, log_name)):
+            sources.append(transforms)
+            continue
         if not configured:
             source = _by_type(role, fields, definitions, summary, log_name, counts or {})
             sources += [source] if source else []
@@ -125,10 +117,10 @@ def choose_sources(
                 raise
             summary.add(error.reason_code, 1, f"{error.sentence} The log is read without its {role}.")
     vps = next((source.topic for source in sources if source.role == "vps"), None)
-    if not mapping.vps:
-        tell_of_references(vps, definitions, summary, log_name)
-        if vps is not None and is_estimate(vps):
-            sources = [source for source in sources if source.role != "vps"]
+    if vps is not None and not mapping.vps and tell_of_estimate(vps, summary, log_name):
+        sources = [source for source in sources if source.role != "vps"]
+    if not any(source.role in ("vps", "frames") for source in sources):
+        sources += frames_of_transforms(definitions)
     given = {value for source in sources for value in source.values}
     if not given & {"gyroscope", "accelerometer", "magnetometer"}:
         raise UnreadableLog(

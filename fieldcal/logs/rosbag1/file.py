@@ -1,0 +1,210 @@
+"""A ROS 1 bag read in file order, whatever happened to its index; behind damage at the next chunk that is whole."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldcal.errors import UnreadableLog
+from fieldcal.logs.interface import LogSummary
+from fieldcal.logs.mcap.mapped import map_file
+from fieldcal.logs.messages.container import Block
+from fieldcal.logs.messages.definitions import Channel, Definitions, Schema
+from fieldcal.logs.rosbag1.chunks import ChunkOpener, is_record, next_chunk
+from fieldcal.logs.rosbag1.records import (
+    BAG_HEADER,
+    CHUNK,
+    CHUNK_INFO,
+    CONNECTION,
+    MAGIC,
+    MESSAGE,
+    Buffer,
+    Damage,
+    Record,
+    messages_of,
+    read_fields,
+    read_record,
+    walk,
+)
+from fieldcal.logs.rosbag1.report import Tally, report
+from fieldcal.reason_codes import ReasonCode
+
+_LOOSE_BYTES = 4 << 20
+
+
+class BagContainer:
+    """The file as a `Container`.
+
+    Raises
+    ------
+    UnreadableLog
+        `empty_file`, `not_readable`, `not_bag`; `no_messages`: no topic is defined in what is left of it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._name = path.name
+        self._buffer = map_file(path)
+        self._limit = len(self._buffer)
+        self.definitions = Definitions()
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._tally = Tally()
+        self._said: Counter[int] | None = None
+        self._check_magic()
+        closed, index = self._bag_header()
+        self._closed = closed
+        if not (closed and self._read_index(index)):
+            for _ in self.blocks(frozenset()):
+                pass
+            self._tally = Tally()
+        if not self.definitions.channels:
+            raise UnreadableLog(
+                ReasonCode.NO_MESSAGES,
+                f"{self._name} holds no whole chunk and no definition of any topic: it was cut or damaged before the "
+                "first messages were safe. Nothing of it can be used.",
+            )
+
+    @property
+    def counts(self) -> Mapping[int, int] | None:
+        """See `Container`."""
+        return self._said
+
+    def blocks(self, channels: Collection[int]) -> Iterator[Block]:
+        """See `Container`. Chunks are read whole: of every channel."""
+        opener = ChunkOpener(self._buffer)
+        position: int | None = len(MAGIC)
+        while position is not None and position < self._limit:
+            try:
+                record = read_record(self._buffer, position, self._limit, whole=False)
+                if record.opcode != CHUNK and record.end > self._limit:
+                    raise Damage(f"the record at byte {position} ends behind the file")
+                if record.opcode == CHUNK:
+                    content = opener.open(record, self._limit)
+                    yield from self._stretch(np.frombuffer(content, np.uint8), record.start)
+                elif record.opcode == MESSAGE:
+                    end = self._loose_end(position)
+                    yield from self._stretch(np.frombuffer(self._buffer, np.uint8, end - position, position), position)
+                    position = end
+                    continue
+                elif record.opcode == CONNECTION:
+                    self._define(self._buffer, record)
+            except Damage as damage:
+                self._tally.damaged.append((position, str(damage)))
+                position = self._behind(position)
+                continue
+            if record.end > self._limit:
+                self._tally.damaged.append((position, f"the chunk ends {record.end - self._limit} bytes too early"))
+            position = record.end
+
+    def report(self, summary: LogSummary) -> None:
+        """See `Container`. Nothing in a bag is under a checksum."""
+        report(self._name, self._limit, self._closed, self._tally, self.definitions, self._said, summary)
+
+    def _check_magic(self) -> None:
+        begin = self._buffer[: len(MAGIC)]
+        if begin.startswith(b"#ROSRECORD") or (begin.startswith(b"#ROSBAG V") and begin != MAGIC):
+            version = begin.decode("ascii", "replace").strip()
+            raise UnreadableLog(
+                ReasonCode.NOT_BAG,
+                f"{self._name} is a bag of another format ({version}); 2.0 is read. Convert it: rosbag fix.",
+            )
+        if begin != MAGIC and next_chunk(self._buffer, 0, self._limit) is None:
+            raise UnreadableLog(
+                ReasonCode.NOT_BAG,
+                f"{self._name} does not begin like a ROS bag and holds no whole chunk. Check what it is.",
+            )
+
+    def _bag_header(self) -> tuple[bool, int]:
+        """Whether the recorder closed the bag, and where the index begins. Raises UnreadableLog for encrypted bags."""
+        try:
+            record = read_record(self._buffer, len(MAGIC), self._limit)
+            if record.opcode != BAG_HEADER:
+                return False, 0
+            if record.fields.get(b"encryptor", (0, b""))[1]:
+                raise UnreadableLog(ReasonCode.NOT_BAG, f"{self._name} is encrypted. Decrypt it: rosbag decrypt.")
+            index = record.number(b"index_pos")
+        except Damage:
+            return False, 0
+        return index > 0, index
+
+    def _read_index(self, position: int) -> bool:
+        """Take connections and counts from the index at the file's end; whether it is whole."""
+        definitions, said = Definitions(), Counter[int]()
+        try:
+            while position < self._limit:
+                record = read_record(self._buffer, position, self._limit)
+                if record.opcode == CONNECTION:
+                    _add_connection(definitions, self._buffer, record)
+                elif record.opcode == CHUNK_INFO:
+                    pairs = np.frombuffer(self._buffer[record.data : record.end], "<u4")
+                    for connection, count in pairs[: len(pairs) // 2 * 2].reshape(-1, 2).tolist():
+                        said[connection] += count
+                else:
+                    return False
+                position = record.end
+        except (Damage, ValueError):
+            return False
+        if definitions.channels:
+            self.definitions, self._said = definitions, said
+        return bool(definitions.channels)
+
+    def _stretch(self, data: NDArray[np.uint8], place: int) -> Iterator[Block]:
+        """The messages of a chunk's content, or of bytes of the file."""
+        starts, headers, damage = walk(data.data, 0, data.size)
+        messages, others, malformed = messages_of(data, starts, headers)
+        if damage or malformed:
+            self._tally.damaged.append((place, damage or f"{malformed} records of the chunk are none"))
+        for start in others:
+            try:
+                record = read_record(data.data, start, data.size)
+                if record.opcode == CONNECTION:
+                    self._define(data.data, record)
+            except Damage as error:
+                self._tally.damaged.append((place, str(error)))
+        if messages.starts.size:
+            ids, counts = np.unique(messages.connections, return_counts=True)
+            self._tally.messages.update(dict(zip(ids.tolist(), counts.tolist(), strict=True)))
+            yield Block(data, messages.starts, messages.sizes, messages.connections, messages.log_time_ns)
+
+    def _loose_end(self, position: int) -> int:
+        """The end of a run of messages outside chunks."""
+        begin = position
+        while position < self._limit and position - begin < _LOOSE_BYTES:
+            try:
+                record = read_record(self._buffer, position, self._limit)
+            except Damage:
+                break
+            if record.opcode not in (MESSAGE, CONNECTION):
+                break
+            position = record.end
+        return position
+
+    def _behind(self, position: int) -> int | None:
+        """Where reading goes on behind damage: the end that the record declares, else the next chunk."""
+        try:
+            end = read_record(self._buffer, position, self._limit).end
+            if end > position and is_record(self._buffer, end, self._limit):
+                return end
+        except Damage:
+            pass
+        return next_chunk(self._buffer, position + 1, self._limit)
+
+    def _define(self, buffer: Buffer, record: Record) -> None:
+        try:
+            _add_connection(self.definitions, buffer, record)
+        except Damage as damage:
+            self._tally.damaged.append((record.start, str(damage)))
+
+
+def _add_connection(definitions: Definitions, buffer: Buffer, record: Record) -> None:
+    """A connection is a channel with a schema of its own. Raises Damage."""
+    connection, topic = record.number(b"conn"), record.value(b"topic").decode("utf-8", "replace")
+    fields = {name: value for name, (_, value) in read_fields(buffer, record.data, record.end)}
+    if b"type" not in fields:
+        raise Damage(f"the connection of {topic} names no type")
+    text = fields.get(b"message_definition", b"")
+    definitions.add(Schema(connection, fields[b"type"].decode("utf-8", "replace"), "ros1msg", text))
+    definitions.add(Channel(connection, connection, topic, "ros1", ()))
