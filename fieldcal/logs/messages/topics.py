@@ -13,7 +13,7 @@ ESTIMATES = ("local_position", "global_position", "ekf", "estimat", "filtered", 
 
 
 def tell_of_estimate(vps: str, summary: LogSummary, log_name: str) -> bool:
-    """Whether the topic `vps`, which nothing configures, carries an estimate of the vehicle's own; told, and not used."""
+    """Whether the topic `vps`, which nothing configures, carries an estimate of the vehicle's own; it is told."""
     if is_estimate(vps):
         summary.add(
             ReasonCode.VPS_IS_ESTIMATE,
