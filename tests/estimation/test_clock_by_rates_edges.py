@@ -369,7 +369,7 @@ def test_stamps_on_either_clock() -> None:
     """t_vps = (t_imu − ref)(1 + skew) + ref − lag, there and back; the lag at the first sample is on that line."""
     fit = by_rates.SyncFit(
         lag_mid_s=-0.4, skew_ppm=2e5, covariance=np.diag([4e-6, 9e-12]), peak=1.0, runner_up=0.0, peak_width_s=1.0,
-        explained=1.0, matrix=np.eye(3), reference_s=15.0, first_s=10.0,
+        explained=1.0, matrix=np.eye(3), reference_s=15.0, first_s=10.0, turning=np.eye(3),
     )  # fmt: skip
     t = np.array([10.0, 15.0, 20.0])
     vps = (t - 15.0) * 1.2 + 15.0 + 0.4
