@@ -67,7 +67,9 @@ def _angle(a: Array, b: Array) -> Array:
     return np.asarray(2.0 * np.arccos(np.clip(np.nan_to_num(cosine, nan=1.0), 0.0, 1.0)))
 
 
-def _frozen_runs(t: Array, q: Array, start: Array, length: Array, step: Array, least: float) -> NDArray[np.bool_]:
+def _frozen_runs(
+    t: Array, q: Array, start: np.ndarray, length: np.ndarray, step: Array, least: float
+) -> NDArray[np.bool_]:
     """Runs of one pose during which the vehicle turned, by how it turned before and after."""
     n, last = len(t), start + length - 1
     lasted = t[np.minimum(last + 1, n - 1)] - t[start]
@@ -88,12 +90,12 @@ def _frozen_runs(t: Array, q: Array, start: Array, length: Array, step: Array, l
     return np.asarray(frozen | ((last == n - 1) & (start > 0) & stops))
 
 
-def _speed(t: Array, q: Array, a: Array, b: Array) -> Array:
+def _speed(t: Array, q: Array, a: np.ndarray, b: np.ndarray) -> Array:
     """Rate of turn from poses a to b (indices), rad/s."""
     return np.asarray(_angle(q[a], q[b]) / np.maximum(t[b] - t[a], 1e-6))
 
 
-def _default(value: Array, start: Array, step: Array, least: float, poses: Array) -> NDArray[np.bool_]:
+def _default(value: np.ndarray, start: np.ndarray, step: Array, least: float, poses: Array) -> NDArray[np.bool_]:
     """Rows of a value that comes again and again, or of the identity at the origin, where it is reached by a jump."""
     jump = np.maximum(np.r_[0.0, step], np.r_[step, 0.0])
     jumps = jump > max(JUMP_RATIO * float(np.quantile(step, 0.95)) + least, LEAST_JUMP_RAD) if len(step) else jump > 0
