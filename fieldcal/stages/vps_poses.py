@@ -10,7 +10,7 @@ import polars as pl
 
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.clock_sync.by_rates import SyncFit, mask_outliers
-from fieldcal.estimation.clock_sync.handedness import READINGS, better_reading, handedness
+from fieldcal.estimation.clock_sync.handedness import READINGS, better_readings, handedness, mounting_deg
 from fieldcal.estimation.clock_sync.repeated_poses import find_repeats
 from fieldcal.estimation.clock_sync.search import find_clock
 from fieldcal.estimation.faults import Fault
@@ -65,8 +65,8 @@ def vps_attitude(q: Array, s: VpsAttitude) -> Array:
 def admitted_poses(vps: pl.DataFrame, origin_ns: int, length_s: float, s: VpsPoses) -> AdmittedPoses:
     """The poses of table `vps` less those that the system repeated, made up or got wrong; each kind is told.
 
-    `origin_ns`, `length_s`: the IMU's first stamp, and its record's length. Clocks of different epochs: their starts are
-    aligned first, as integers."""
+    `origin_ns`, `length_s`: the IMU's first stamp, and its record's length. Clocks of different epochs: their starts
+    are aligned first, as integers."""
     base_ns = int(vps["t_ns"][0]) - origin_ns
     if abs(base_ns) * 1e-9 <= s.vps_max_lag_s + length_s:
         base_ns = 0
@@ -128,7 +128,8 @@ def _with_gap(poses: AdmittedPoses, s: VpsPoses) -> AdmittedPoses:
     if len(poses.t) < 3:
         return poses
     step = np.diff(poses.t)
-    interval = float(np.median(step))
+    usual = step[step < 1.5 * np.median(step)]
+    interval = float(usual.mean())  # the median of a few steps of jitter is beside it
     gap = max(s.vps_max_gap_s, min(GAP_INTERVALS * interval, LONGEST_GAP_S))
     # From stamp to stamp, whole intervals taken off: both stamps' scatter is in it.
     off = step - np.maximum(np.rint(step / interval), 1.0) * interval
@@ -193,34 +194,35 @@ def clock_of(poses: AdmittedPoses, t_imu: Array, rate: Array, q: Array, s: VpsPo
         raise UnusableFlight(
             ReasonCode.VPS_MIRRORED,
             f"The VPS's turns are {'mirrored' if found.is_mirror else 'sheared'} against the gyroscope's"
-            f" ({100 * found.from_rotation:.0f} % of their variance is beside any rotation): check polarity.gyroscope"
-            " and rotation_body_from_sensor, and whether the VPS's axes are right-handed.",
+            f" ({100 * min(found.from_rotation, 1.0):.0f} % of their variance is beside any rotation): check"
+            " polarity.gyroscope and rotation_body_from_sensor, and whether the VPS's axes are right-handed.",
             {"beside_rotation": found.from_rotation, "beside_mirror": found.from_mirror},
         )
     return fit
 
 
+MEND = {
+    "inverse": "the inverse, world to body: log body to world, which has x, y and z with the other sign",
+    "scalar first": "scalar first: name the columns in the order in which they stand as csv.vps.quaternion_wxyz, or log"
+    " the scalar last",
+}
+
+
 def _refuse_other_reading(poses: AdmittedPoses, t_imu: Array, rate: Array, s: VpsPoses, explained: float) -> None:
     """Raise `vps_mirrored` where the quaternions fit as something else than body to world, scalar last. It is not used:
-    what else the log's writer has mistaken (the world's axes, the position) the rates do not tell."""
+    which of the two mistakes it is only the mounting tells, and nothing what else was mistaken with it."""
     readings = {name: vps_attitude(read(poses.logged), s) for name, read in READINGS.items()}
-    better = better_reading(
+    better = better_readings(
         t_imu, rate, poses.t, readings, explained, min_peak=s.vps_min_peak, max_gap_s=poses.max_gap_s
     )
-    if better is None:
+    if not better:
         return
-    name, fit = better
-    mend = []
-    if "scalar first" in name:
-        mend.append("name the columns as csv.vps.quaternion_wxyz, in the order in which they stand")
-    if "inverse" in name:
-        mend.append("write body to world into the log: x, y and z of the quaternion with the other sign")
+    told = [f"{MEND[name]} (then mounted {mounting_deg(fit):.0f}° from the IMU's axes)" for name, fit in better.items()]
     raise UnusableFlight(
         ReasonCode.VPS_MIRRORED,
-        f"The VPS's quaternions are no attitudes body to world, scalar last: they fit the gyroscope as {name}"
-        f" ({100 * fit.explained:.1f} % of its variance; as given {100 * explained:.1f} %). To mend it"
-        f" {', and '.join(mend)}.",
-        {"explained": explained, "explained_otherwise": fit.explained, "fits_as": name},
+        "The VPS's quaternions are no attitudes body to world, scalar last: they turn the other way than the gyroscope."
+        f" They are {'; or '.join(told)}.",
+        {"explained": explained, "fits_as": list(better)},
     )
 
 

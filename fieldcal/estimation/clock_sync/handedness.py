@@ -1,8 +1,9 @@
 """Whether a VPS's attitudes are what they are said to be: body to world, scalar last.
 
-The inverse of a quaternion, or one whose elements are in another order, turns as fast as the right one, so that the
-lengths of its rates match the gyroscope's all the same. The map from its rates to the gyroscope's does not: it is a
-mirror, or none that holds throughout. Whichever reading of the quaternion makes a rotation of it is the right one.
+The inverse of a quaternion, or one with the scalar first, turns as fast as the right one, so that the lengths of its
+rates match the gyroscope's all the same. The map from its rates to the gyroscope's does not: it is a mirror, or none
+that holds throughout. Both mistakes are one up to constant rotations (to move the scalar is to invert, and to turn
+world and body by a constant), so that only the mounting tells them apart; and both at once are none but for these.
 """
 
 from __future__ import annotations
@@ -15,20 +16,21 @@ from numpy.typing import ArrayLike
 
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.clock_sync.by_rates import SyncFit, synchronise
+from fieldcal.estimation.wahba import nearest_rotation
 from fieldcal.geometry.rotation import Array, conjugate
 
 READINGS: dict[str, Callable[[Array], Array]] = {
-    "the inverse, world to body": conjugate,
+    "inverse": conjugate,
     "scalar first": lambda q: q[..., [1, 2, 3, 0]],
-    "scalar first and the inverse, world to body": lambda q: conjugate(q[..., [1, 2, 3, 0]]),
 }
 """What quaternions (n, 4) that are not body to world, scalar last, can be → how to make them so."""
 
 # Shares of the variance of the VPS's rates. A mirror that fits so much better is one; mountings, cross-axis terms and
 # wrong scales stay below the second.
 MIRROR_SHARE, LARGEST_SHEAR = 0.05, 0.15
-# Another reading is the right one where it leaves less than this share of what the given one leaves unexplained.
-CLEARLY = 0.3
+# Another reading is the right one where it leaves less than this share of what the given one leaves unexplained, both
+# by the same readings of the gyroscope. An axis of the gyroscope that is wired the other way does the opposite.
+CLEARLY = 0.97
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,14 @@ def _distance(m: Array, turning: Array, determinant: float) -> float:
     return float(np.trace(off @ turning @ off.T) / np.trace(turning))
 
 
-def better_reading(
+def mounting_deg(fit: SyncFit) -> float:
+    """Angle of the rotation from the VPS's body axes to the gyroscope's, degrees, by the fit's map."""
+    row = np.linalg.norm(fit.matrix, axis=1)
+    rotation = nearest_rotation(fit.matrix / np.maximum(row, 1e-300)[:, None])
+    return float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(rotation) - 1.0), -1.0, 1.0))))
+
+
+def better_readings(
     t_imu: ArrayLike,
     rate_imu: ArrayLike,
     t_vps: ArrayLike,
@@ -77,10 +86,10 @@ def better_reading(
     *,
     min_peak: float,
     max_gap_s: float,
-) -> tuple[str, SyncFit] | None:
-    """Of other `readings` of the logged quaternions, name → attitudes (m, 4), the one that fits as a rotation and
-    clearly better than the given one, which explains a share `explained` of the gyroscope's variance, with its clock.
-    None without one. The rest as in `by_rates.synchronise`."""
+) -> dict[str, SyncFit]:
+    """Of other `readings` of the logged quaternions, name → attitudes (m, 4), those that fit as a rotation and better
+    than the given one, which explains a share `explained` of the gyroscope's variance, that with the least mounting
+    first. The rest as in `by_rates.synchronise`."""
     fits: dict[str, SyncFit] = {}
     for name, q in readings.items():
         try:
@@ -89,4 +98,4 @@ def better_reading(
             continue
         if handedness(fit).is_rotation and 1.0 - fit.explained < CLEARLY * (1.0 - explained):
             fits[name] = fit
-    return max(fits.items(), key=lambda found: found[1].explained, default=None)
+    return dict(sorted(fits.items(), key=lambda found: mounting_deg(found[1])))

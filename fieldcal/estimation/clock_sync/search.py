@@ -103,7 +103,7 @@ def _surely(fit: SyncFit) -> SyncFit:
     raise UnusableFlight(
         ReasonCode.NOT_THE_SAME_MOTION,
         f"At the best of all lags, {fit.lag_mid_s:.1f} s, the VPS explains {100 * fit.explained:.0f} % of the"
-        f" gyroscope's variance, where {100 * SURELY_EXPLAINED:.0f} % are needed so far from vps_max_lag_s: not the same"
+        f" gyroscope's variance, where {100 * SURELY_EXPLAINED:.0f} % are needed beyond vps_max_lag_s: not the same"
         " motion.",
         {"explained": fit.explained, "lag_mid_s": fit.lag_mid_s, "peak": fit.peak, "runner_up": fit.runner_up},
     )
