@@ -71,8 +71,7 @@ def admitted_poses(vps: pl.DataFrame, origin_ns: int, length_s: float, s: VpsPos
     if abs(base_ns) * 1e-9 <= s.vps_max_lag_s + length_s:
         base_ns = 0
     t, logged = seconds(vps["t_ns"], origin_ns + base_ns), matrix(vps, QUATERNION)
-    position = matrix(vps, POSITION)
-    repeats = find_repeats(t, logged, position)
+    repeats = find_repeats(t, logged)
     keep = ~(repeats.held | repeats.frozen | repeats.default)
     q = vps_attitude(logged, s)
     jumps = np.zeros(len(t), dtype=bool)
@@ -101,7 +100,7 @@ def admitted_poses(vps: pl.DataFrame, origin_ns: int, length_s: float, s: VpsPos
         t[keep],
         logged[keep],
         q[keep],
-        in_ned(position, s.world)[keep],
+        in_ned(matrix(vps, POSITION), s.world)[keep],
         base_ns * 1e-9,
         float((repeats.frozen | repeats.default | jumps).mean()),
         s.vps_max_gap_s,
@@ -196,7 +195,7 @@ def clock_of(poses: AdmittedPoses, t_imu: Array, rate: Array, q: Array, s: VpsPo
             f"The VPS's turns are {'mirrored' if found.is_mirror else 'sheared'} against the gyroscope's"
             f" ({100 * min(found.from_rotation, 1.0):.0f} % of their variance is beside any rotation): check"
             " polarity.gyroscope and rotation_body_from_sensor, and whether the VPS's axes are right-handed.",
-            {"beside_rotation": found.from_rotation, "beside_mirror": found.from_mirror},
+            {"beside_rotation": found.from_rotation, "beside_mirror": found.from_mirror, **_peak(fit)},
         )
     return fit
 
@@ -222,8 +221,12 @@ def _refuse_other_reading(poses: AdmittedPoses, t_imu: Array, rate: Array, s: Vp
         ReasonCode.VPS_MIRRORED,
         "The VPS's quaternions are no attitudes body to world, scalar last: they turn the other way than the gyroscope."
         f" They are {'; or '.join(told)}.",
-        {"explained": explained, "fits_as": list(better)},
+        {"explained": explained, "fits_as": list(better), **_peak(next(iter(better.values())))},
     )
+
+
+def _peak(fit: SyncFit) -> dict[str, Json]:
+    return {"peak": fit.peak, "runner_up": fit.runner_up, "coarse_lag_s": fit.lag_mid_s}
 
 
 def far_clock(poses: AdmittedPoses, lag_s: float, s: VpsPoses) -> tuple[Fault, ...]:

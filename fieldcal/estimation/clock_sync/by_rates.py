@@ -39,7 +39,7 @@ REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock
 MOST_GRID_PER_SAMPLE = 20  # a grid over hours of which minutes were recorded fills the memory with gaps
 MIN_EXPLAINED, MAX_SKEW_PPM, MAX_LAG_SD_S = 0.6, 2000.0, 0.01
 SURELY_EXPLAINED = 0.9  # share from which an impossible clock, not another motion, is what differs
-GAP_RATIO = 3.0  # of the usual time between the neighbours of a pose, which is then beside a gap
+FASTEST_RADPS2 = 50.0  # angular acceleration that may bend the way over a pose
 LEAST_OVERLAP_S = 5.0  # of both records at a lag that is looked at, or half of the shorter one
 SLOW_POSE_S = 0.0125  # poses further apart are interpolated by a cubic: the turn between them is not steady
 
@@ -112,7 +112,7 @@ def mask_outliers(t: ArrayLike, q: ArrayLike, *, max_rate: float = 40.0) -> np.n
     """Which VPS attitudes (n, 4) at stamps t to keep, (n,) bool: finite, unit, near their neighbours.
 
     A sample is an outlier when the shortest path over it (before → it → after) is longer than the direct one by more
-    than the motion explains (robust threshold), or implies more than `max_rate` rad/s."""
+    than the motion explains (robust threshold; 50 rad/s² of acceleration), or implies more than `max_rate` rad/s."""
     t, q = np.asarray(t, dtype=float), np.asarray(q, dtype=float)
     keep = np.abs(np.linalg.norm(q, axis=1) - 1.0) < 0.05  # not where one is NaN or infinite
     keep &= np.r_[True, np.diff(t) > 0]
@@ -121,10 +121,9 @@ def mask_outliers(t: ArrayLike, q: ArrayLike, *, max_rate: float = 40.0) -> np.n
         if len(i) < 5:
             return keep
         middle = _deviation(q[i[:-2]], q[i[1:-1]], q[i[2:]], t[i])
-        # Across a gap the way is no line: what it deviates grows with the square of the gap.
-        span = t[i[2:]] - t[i[:-2]]
-        gap = np.where(span > GAP_RATIO * np.median(span), span / np.median(span), 1.0)
-        limit = max(10.0 * robust_sigma(middle), 2e-3) * gap**2
+        # Between slow poses, or beside a gap, the way is no line where the vehicle speeds up.
+        curved = 0.5 * FASTEST_RADPS2 * (t[i[1:-1]] - t[i[:-2]]) * (t[i[2:]] - t[i[1:-1]])
+        limit = np.maximum(max(10.0 * robust_sigma(middle), 2e-3), curved)
         bad = np.zeros(len(i), dtype=bool)
         bad[1:-1] = middle > limit
         step = np.linalg.norm(to_rotation_vector(multiply(conjugate(q[i[:-1]]), q[i[1:]])), axis=1)

@@ -19,7 +19,9 @@ FEWEST_FROZEN, FROZEN_RATIO = 5, 3  # rows alike that are a frozen tracker, and 
 SPEED_OVER_S = 0.05  # what the vehicle turned just before and after a run of poses alike
 # Less than this has not turned: a tracker's noise, or a few steps of rounded quaternions.
 LEAST_TURN_RAD, ROUNDING_STEPS = float(np.radians(0.2)), 4
-AT_THE_END_S, TURN_AT_THE_END_RAD = 0.2, float(np.radians(1.0))
+# No vehicle comes to rest, to the last bit, at more than this; nor by steps as long as it otherwise makes (quantiles
+# of those: of a run between two others, and of one at the end, where only the one before is known).
+FASTEST_STOP_RADPS2, SHORT_STEPS, SHORT_LAST_STEPS = 10.0, 0.2, 0.5
 # A default pose: so many rows of one value, which is left or reached by a jump that no ordinary step comes near.
 FEWEST_DEFAULT, JUMP_RATIO, LEAST_JUMP_RAD = 10, 5.0, float(np.radians(5.0))
 
@@ -35,23 +37,20 @@ class Repeats:
     rows_a_pose: int
 
 
-def find_repeats(t: ArrayLike, q: ArrayLike, position: ArrayLike) -> Repeats:
-    """Repeated poses at stamps t (n,), s, ascending: attitudes q (n, 4) and positions (n, 3), m, exactly as logged; NaN
-    where there is none."""
+def find_repeats(t: ArrayLike, q: ArrayLike) -> Repeats:
+    """Repeated poses at stamps t (n,), s, ascending, by their attitudes q (n, 4), exactly as logged."""
     t, q = np.asarray(t, dtype=float), np.asarray(q, dtype=float)
     n = len(t)
     nothing = np.zeros(n, dtype=bool)
     if n < FEWEST_FROZEN:
         return Repeats(nothing, nothing, nothing, 1)
-    # NaN as a value like any other: a position that is missing throughout is no difference.
-    poses = np.column_stack([q, np.nan_to_num(np.asarray(position, dtype=float), nan=np.inf)])
-    value = np.unique(poses, axis=0, return_inverse=True)[1].reshape(n)
+    value = np.unique(q, axis=0, return_inverse=True)[1].reshape(n)
     start = run_starts(value)
     length = np.diff(np.r_[start, n])
     usual = int(np.median(length))
-    least = max(LEAST_TURN_RAD, ROUNDING_STEPS * 2.0 * max(resolution(c[np.isfinite(c)]) for c in q.T))
+    least = max(LEAST_TURN_RAD, _rounding(q))
     step = _angle(q[start[:-1]], q[start[1:]])
-    default = _default(value, start, step, least, poses)
+    default = _default(value, start, step, least, q)
     frozen_run = _frozen_runs(t, q, start, length, step, least) & (length >= max(FEWEST_FROZEN, FROZEN_RATIO * usual))
     row = np.repeat(np.arange(len(start)), length)
     in_run = np.arange(n) - start[row]
@@ -72,22 +71,31 @@ def _frozen_runs(
 ) -> NDArray[np.bool_]:
     """Runs of one pose during which the vehicle turned, by how it turned before and after."""
     n, last = len(t), start + length - 1
-    lasted = t[np.minimum(last + 1, n - 1)] - t[start]
     # Just before the run: from a pose some hundredths of a second earlier to its own; after it likewise.
     earlier = np.clip(np.searchsorted(t, t[start] - SPEED_OVER_S), 0, np.maximum(start - 1, 0))
     after = np.minimum(last + 1, n - 1)
     later = np.minimum(np.maximum(np.searchsorted(t, t[after] + SPEED_OVER_S), after + 1), n - 1)
-    before_radps = _speed(t, q, earlier, start)
-    after_radps = _speed(t, q, after, later)
-    inside = (start > 0) & (last < n - 2)
-    frozen = inside & (np.minimum(before_radps, after_radps) * lasted > least)
+    before_radps, after_radps = _speed(t, q, earlier, start), _speed(t, q, after, later)
     # Out of a rest a vehicle starts no faster than it then goes on.
-    out = np.r_[step, 0.0]
+    into, out = np.r_[0.0, step], np.r_[step, 0.0]
     ordinary = np.maximum(before_radps, after_radps) * (t[after] - t[last])
-    frozen |= out > 2.0 * ordinary + least
-    # Nothing comes after: a vehicle in motion does not stop from one pose to the next.
-    stops = before_radps * np.minimum(lasted, AT_THE_END_S) > max(TURN_AT_THE_END_RAD, least)
-    return np.asarray(frozen | ((last == n - 1) & (start > 0) & stops))
+    jumped = out > 2.0 * ordinary + least
+    # What is left of the speed at the run's ends, if it was braked that long, and the way to its stop.
+    slowed = [
+        v - 0.5 * FASTEST_STOP_RADPS2 * d
+        for v, d in ((before_radps, t[start] - t[earlier]), (after_radps, t[later] - t[after]))
+    ]
+    too_fast = np.maximum(*(np.maximum(v, 0.0) for v in slowed)) ** 2 / (2.0 * FASTEST_STOP_RADPS2) > least
+    rounding = _rounding(q)
+    short, short_last = np.quantile(step, [SHORT_STEPS, SHORT_LAST_STEPS]) if len(step) else (0.0, 0.0)
+    by_steps = np.minimum(into, out) > max(float(short), rounding)
+    by_last_step = (last == n - 1) & (into > max(float(short_last), rounding))
+    return np.asarray(jumped | too_fast | by_steps | by_last_step)
+
+
+def _rounding(q: Array) -> float:
+    """Angle that is no rounding of attitudes q (n, 4), rad."""
+    return ROUNDING_STEPS * 2.0 * max(resolution(c[np.isfinite(c)]) for c in q.T)
 
 
 def _speed(t: Array, q: Array, a: np.ndarray, b: np.ndarray) -> Array:
@@ -95,15 +103,13 @@ def _speed(t: Array, q: Array, a: np.ndarray, b: np.ndarray) -> Array:
     return np.asarray(_angle(q[a], q[b]) / np.maximum(t[b] - t[a], 1e-6))
 
 
-def _default(value: np.ndarray, start: np.ndarray, step: Array, least: float, poses: Array) -> NDArray[np.bool_]:
-    """Rows of a value that comes again and again, or of the identity at the origin, where it is reached by a jump."""
-    jump = np.maximum(np.r_[0.0, step], np.r_[step, 0.0])
-    jumps = jump > max(JUMP_RATIO * float(np.quantile(step, 0.95)) + least, LEAST_JUMP_RAD) if len(step) else jump > 0
+def _default(value: np.ndarray, start: np.ndarray, step: Array, least: float, q: Array) -> NDArray[np.bool_]:
+    """Rows of a value that comes again and again, or of the identity, where one of its runs is reached by a jump."""
     rows, runs = np.bincount(value), np.bincount(value[start])
     again = (rows >= FEWEST_DEFAULT) & (runs >= 2)
-    none = np.zeros(poses.shape[1])
-    none[3] = 1.0
-    at_origin = np.all((np.abs(poses) == none) | (poses == np.inf), axis=1)
-    suspect = again[value] | at_origin
-    wrong = np.unique(value[start[jumps]])
-    return np.asarray(suspect & np.isin(value, wrong))
+    suspect = again[value] | np.all(np.abs(q) == np.array([0.0, 0.0, 0.0, 1.0]), axis=1)
+    known = ~suspect[start]
+    ordinary = step[known[:-1] & known[1:]]
+    limit = JUMP_RATIO * float(np.quantile(ordinary, 0.95)) + least if len(ordinary) else least
+    jumps = np.maximum(np.r_[0.0, step], np.r_[step, 0.0]) > max(limit, LEAST_JUMP_RAD)
+    return np.asarray(suspect & np.isin(value, value[start[jumps]]))

@@ -58,7 +58,7 @@ def find_clock(
         far = _tried(lambda: _surely(anywhere(*given, min_peak=min_peak, max_gap_s=max_gap_s)))
         if isinstance(far, SyncFit):
             return far
-        refused.append(far)
+        refused.insert(0, far)
     # Also where rates that differ were found: from the wrong start their difference is not the whole one.
     imu, vps = on_one_grid(*given, max_gap_s=max_gap_s)
     t = np.asarray(t_imu, dtype=float)
@@ -80,9 +80,9 @@ def _tried(fit: Callable[[], SyncFit]) -> SyncFit | UnusableFlight:
 
 
 def _says(error: UnusableFlight) -> tuple[bool, bool, float]:
-    """How much a refusal says: clocks of other rates the most, the better the more; two motions that resemble each
-    other more than a low correlation; of those the one at any lag."""
-    explained = error.measured.get("explained", error.measured.get("peak"))
+    """How much a refusal says: clocks of other rates the most, then two motions that resemble each other, the better
+    the more; a low correlation the least."""
+    explained = error.measured.get("explained")
     return (
         error.reason_code == ReasonCode.CLOCK_RATES_DIFFER,
         error.reason_code == ReasonCode.NOT_THE_SAME_MOTION,
