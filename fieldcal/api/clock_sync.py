@@ -35,6 +35,8 @@ class Synchronisation(SyncFit):
         Share of the gyroscope's variance that the VPS accounts for.
     matrix : (3, 3) array
         From the VPS's body rates to the given rates.
+    turning : (3, 3) array
+        Covariance of the VPS's body rates over the record, (rad/s)².
     reference_s, first_s : float
         IMU times of mid-record and of the first sample, s.
     t, rate : (n,), (n, 3) arrays

@@ -100,10 +100,18 @@ class Parameters(Table):
         "auto",
         'VPS in the estimate (method joint): "auto" and true use one that can be used, true tells where there is none',
     )
-    vps_max_lag_s: float = parameter(60.0, "largest clock offset searched", "s", within=(0.1, 1e6))
+    vps_max_lag_s: float = parameter(
+        60.0,
+        "clock offset searched first; beyond it only a match without doubt counts, and is told",
+        "s",
+        within=(0.1, 1e6),
+    )
     vps_min_peak: float = parameter(0.5, "refuse a correlation peak below this", "1", within=(0.0, 1.0))
     vps_max_gap_s: float = parameter(
-        0.05, "VPS gaps longer than this are masked, never interpolated", "s", within=(0.001, 10.0)
+        0.05,
+        "VPS gaps longer than this, and than 2.5 of its own intervals (at most 0.3 s), are masked, never interpolated",
+        "s",
+        within=(0.001, 10.0),
     )
 
 

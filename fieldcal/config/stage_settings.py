@@ -147,6 +147,11 @@ class VpsClock(StageSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class VpsPoses(VpsAttitude, VpsClock, Polarity):
+    """What decides which poses of the VPS are admitted, and on which clock."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class EllipsoidSettings(LoggedValues, ReferenceReading):
     """An ellipsoid fit and the limits behind which it is refused."""
 
@@ -259,7 +264,7 @@ class WarmUpSettings(Units):
 
 
 @dataclass(frozen=True, kw_only=True)
-class VpsReference(Axes, VpsAttitude, VpsClock):
+class VpsReference(Axes, VpsPoses):
     """The VPS as a measurement of the joint estimate."""
 
     use_vps: UseVps
@@ -282,7 +287,7 @@ class JointSettings(BodyVectors, ReferenceReading, LocalField, FieldOrigin, Grav
 
 
 @dataclass(frozen=True, kw_only=True)
-class VpsSyncSettings(LoggedValues, Axes, VpsAttitude, VpsClock):
+class VpsSyncSettings(LoggedValues, Axes, VpsPoses):
     """Stage `vps_sync`."""
 
 

@@ -14,7 +14,6 @@ from fieldcal.estimation.clock_sync.by_field import refine_by_field
 from fieldcal.estimation.faults import Fault
 from fieldcal.estimation.wahba import rotation_between
 from fieldcal.geometry import sensor_model
-from fieldcal.geometry.frames import FRD_FROM_FLU_QUATERNION, NED_FROM_ENU_QUATERNION
 from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import (
     IDENTITY,
@@ -25,7 +24,6 @@ from fieldcal.geometry.rotation import (
     from_matrix,
     mean_quaternion,
     multiply,
-    normalise,
     slerp,
 )
 from fieldcal.names import Json, Method, Sensor, Status
@@ -34,9 +32,10 @@ from fieldcal.stages.attitude import logged_constants
 from fieldcal.stages.inputs import Tables, is_sound
 from fieldcal.stages.results import StageResult, fault_rows
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, constants, matrix, seconds, triad
+from fieldcal.stages.vps_poses import AdmittedPoses, admitted_poses, clock_of, far_clock
 
 if TYPE_CHECKING:
-    from fieldcal.config.stage_settings import LoggedValues, VpsAttitude, VpsClock, VpsSyncSettings
+    from fieldcal.config.stage_settings import LoggedValues, VpsSyncSettings
 
 BRIDGE_S = 0.1  # IMU results are interpolated to VPS stamps only between samples this close
 
@@ -59,47 +58,33 @@ def synchronise_vps(tables: Tables, s: VpsSyncSettings) -> StageResult:
         )
     gyro = _gyro_constants(tables, s)
     axes = sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
-    rate = (logged - np.median(logged, axis=0) if gyro is None else sensor_model.calibrate(logged, *gyro)) @ axes.T
+    # As wired at least: a mirrored axis would be taken for a mirrored VPS.
+    right_handed = (logged - np.median(logged, axis=0)) * np.asarray(s.polarity[Sensor.GYROSCOPE], dtype=float)
+    rate = (right_handed if gyro is None else sensor_model.calibrate(logged, *gyro)) @ axes.T
     origin = int(imu["t_ns"][0])
     t_imu = seconds(imu["t_ns"], origin)
-    # Clocks of different epochs: their starts are aligned first, as integers.
-    base_ns = int(vps["t_ns"][0]) - origin
-    if abs(base_ns) * 1e-9 <= s.vps_max_lag_s + t_imu[-1]:
-        base_ns = 0
-    t_vps = seconds(vps["t_ns"], origin + base_ns)
-    q_vps = vps_attitude(matrix(vps, QUATERNION), s)
-    keep = by_rates.mask_outliers(t_vps, q_vps)
-    measured: dict[str, Json] = {
-        "vps_samples": len(keep),
-        "vps_masked": int((~keep).sum()),
-        "gyro_calibrated": gyro is not None,
-    }
-    t_vps, q_vps = t_vps[keep], q_vps[keep]
+    poses = admitted_poses(vps, origin, float(t_imu[-1]), s)
+    measured: dict[str, Json] = {**poses.measured, "gyro_calibrated": gyro is not None}
+    t_vps, q_vps = poses.t, poses.q
     try:
-        fit = by_rates.synchronise(
-            t_imu,
-            rate,
-            t_vps,
-            q_vps,
-            max_lag_s=s.vps_max_lag_s,
-            min_peak=s.vps_min_peak,
-            max_gap_s=s.vps_max_gap_s,
-        )
+        fit = clock_of(poses, t_imu, rate, q_vps, s)
     except UnusableFlight as error:
         row = _sync_row(
             {"status": Status.REFUSED, "peak": error.measured.get("peak"), "runner_up": error.measured.get("runner_up")}
         )
-        found = {"sync": row}
+        measured |= {**error.measured, "faults": [f.plain() for f in poses.found]}
+        faults = list(poses.found)
         if error.reason_code == ReasonCode.CLOCK_RATES_DIFFER:
-            fault = Fault(Sensor.GYROSCOPE, "", error.reason_code, 0.0, 0.0, True, str(error))
-            found["faults"] = fault_rows([fault])
-        return StageResult(found, Status.REFUSED, error.reason_code, str(error), {**measured, **error.measured})
-    fit, by_field = _refined(fit, tables, s, origin, t_vps, q_vps)
-    measured |= by_field
+            faults.append(Fault(Sensor.GYROSCOPE, "", error.reason_code, 0.0, 0.0, True, str(error)))
+        found = {"sync": row, "faults": fault_rows(faults)}
+        return StageResult(found, Status.REFUSED, error.reason_code, str(error), measured)
+    fit, by_field = _refined(fit, tables, origin, poses)
+    told = [*poses.found, *far_clock(poses, fit.lag_mid_s, s)]
+    measured |= {**by_field, "faults": [f.plain() for f in told]}
     row = _sync_row(
         {
-            "lag_s": fit.lag_s - base_ns * 1e-9,
-            "lag_mid_s": fit.lag_mid_s - base_ns * 1e-9,
+            "lag_s": fit.lag_s - poses.base_s,
+            "lag_mid_s": fit.lag_mid_s - poses.base_s,
             "lag_sd_s": fit.lag_sd_s,
             "skew_ppm": fit.skew_ppm,
             "skew_sd_ppm": fit.skew_sd_ppm,
@@ -109,17 +94,17 @@ def synchronise_vps(tables: Tables, s: VpsSyncSettings) -> StageResult:
         }
     )
     t_vps = fit.to_imu_clock(t_vps)
-    aligned, rotations = _aligned(t_vps, q_vps, t_imu, rate, tables, s, calibrated=gyro is not None)
+    aligned, rotations = _aligned(t_vps, q_vps, t_imu, rate, tables, poses.max_gap_s, calibrated=gyro is not None)
     measured |= rotations | {"peak_width_s": fit.peak_width_s}
     t_ns = np.rint(aligned["t"] * 1e9).astype(np.int64) + origin
     table = pl.DataFrame(
         {"t_ns": t_ns, **columns_of(aligned["q"], QUATERNION), **columns_of(aligned["rate"], RATE_COLUMNS)}
     )
-    return StageResult({"sync": row, "vps_aligned": table}, measured=measured)
+    return StageResult({"sync": row, "vps_aligned": table, "faults": fault_rows(told)}, measured=measured)
 
 
 def _refined(
-    fit: by_rates.SyncFit, tables: Tables, s: VpsClock, origin: int, t_vps: Array, q_vps: Array
+    fit: by_rates.SyncFit, tables: Tables, origin: int, poses: AdmittedPoses
 ) -> tuple[by_rates.SyncFit, dict[str, Json]]:
     """The clock refined by the magnetometer where that has no fault, and the numbers of it."""
     table = tables.get("magnetometer_log")
@@ -127,7 +112,7 @@ def _refined(
         return fit, {"synchronised_by": "gyroscope"}
     logged = matrix(table, triad("magnetometer"))
     refined, field_clock = refine_by_field(
-        seconds(table["t_ns"], origin), logged, t_vps, q_vps, fit, max_gap_s=s.vps_max_gap_s
+        seconds(table["t_ns"], origin), logged, poses.t, poses.q, fit, max_gap_s=poses.max_gap_s
     )
     if field_clock is None:
         return fit, {"synchronised_by": "gyroscope"}
@@ -156,26 +141,18 @@ def _gyro_constants(tables: Tables, s: LoggedValues) -> tuple[Array, Array] | No
     return logged_constants(s, Sensor.GYROSCOPE)
 
 
-def vps_attitude(q: Array, s: VpsAttitude) -> Array:
-    """Logged VPS attitudes, body to world, in the paper's NED and FRD; unit length, continuous."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        q = normalise(q)
-    if s.world == "enu":
-        q = multiply(NED_FROM_ENU_QUATERNION, q)
-    if s.body == "flu":
-        q = multiply(q, FRD_FROM_FLU_QUATERNION)
-    return q
-
-
 def _aligned(
-    t_vps: Array, q_vps: Array, t_imu: Array, rate: Array, tables: Tables, s: VpsClock, *, calibrated: bool
+    t_vps: Array, q_vps: Array, t_imu: Array, rate: Array, tables: Tables, max_gap_s: float, *, calibrated: bool
 ) -> tuple[dict[str, Array], dict[str, Json]]:
     """VPS attitude and rate on a uniform grid at its own rate, IMU clock, both constant rotations applied."""
-    interval = float(np.median(np.diff(t_vps)))
-    rates = by_rates.vps_rates(t_vps, q_vps, interval, max_gap_s=s.vps_max_gap_s)
+    # Rates of slow poses are taken on a finer grid: on their own one five of them are a whole manoeuvre.
+    every = max(1, int(np.ceil(float(np.median(np.diff(t_vps))) / by_rates.SLOW_POSE_S)))
+    interval = float(np.median(np.diff(t_vps))) / every
+    rates = by_rates.vps_rates(t_vps, q_vps, interval, max_gap_s=max_gap_s)
     t = rates.t
     inside = rates.valid & (t >= t_imu[0]) & (t <= t_imu[-1])
-    t, q, vps_rate = t[inside], slerp(t_vps, continuous(q_vps), t[inside]), rates.rate[inside]
+    between = slerp if every == 1 else by_rates.cubic
+    t, q, vps_rate = t[inside], between(t_vps, continuous(q_vps), t[inside]), rates.rate[inside]
     own_rate = smoothing.low_pass(
         np.column_stack([np.interp(t, t_imu, c) for c in rate.T]), by_rates.FINE_CUTOFF_HZ, interval
     )
@@ -202,7 +179,8 @@ def _aligned(
         "vps_body_rotation_deg": float(np.degrees(2 * np.arccos(np.clip(abs(body[3]), 0, 1)))),
         "vps_world_rotation_deg": float(np.degrees(2 * np.arccos(np.clip(abs(world[3]), 0, 1)))),
     }
-    return {"t": t, "q": continuous(q), "rate": vps_rate}, rotations
+    kept = slice(None, None, every)
+    return {"t": t[kept], "q": continuous(q)[kept], "rate": vps_rate[kept]}, rotations
 
 
 def sensor_rotation(vectors: Array, q: Array) -> Array:

@@ -162,7 +162,7 @@ def test_the_clock_is_typed(calibration: fieldcal.Calibration) -> None:
 
 
 def test_a_clock_that_was_refused_is_out_of_reach(log: Path) -> None:
-    clock = fieldcal.calibrate(log, parameters={"vps_max_lag_s": 0.1}).sync
+    clock = fieldcal.calibrate(log, parameters={"vps_min_peak": 1.0}).sync
     assert clock is not None
     assert clock.status == "refused"
     for attempt in (lambda: clock.lag_s, lambda: clock.skew_ppm, clock.plot):

@@ -46,7 +46,7 @@ def slow_known(interval_s: float = 1.0 / 128.0, seconds: float = 20.0, noise: fl
     logged[rng.uniform(size=len(t)) < 0.03] += 20.0 * noise
     fit = by_rates.SyncFit(
         lag_mid_s=0.0, skew_ppm=0.0, covariance=np.diag([1e-4, 1e-4]), peak=1.0, runner_up=0.0, peak_width_s=1.0,
-        explained=1.0, matrix=np.eye(3), reference_s=seconds / 2, first_s=0.0,
+        explained=1.0, matrix=np.eye(3), reference_s=seconds / 2, first_s=0.0, turning=np.eye(3),
     )  # fmt: skip
     refined, own = refine_by_field(t, logged, t_vps, slow(t_vps), fit)
     assert own is not None

@@ -315,7 +315,7 @@ def record(duration_s: float = 30.0, skew_ppm: float = 0.0) -> tuple[np.ndarray,
 
 
 @pytest.mark.parametrize(("skew_ppm", "accepted"), [(1900.0, True), (2100.0, False), (-1900.0, True), (-2100.0, False)])
-def test_clocks_that_drift_apart_by_more_than_two_milliseconds_a_second_are_refused(
+def test_clocks_that_drift_apart_by_more_than_two_milliseconds_a_second_have_other_rates(
     skew_ppm: float, accepted: bool
 ) -> None:
     if accepted:
@@ -325,8 +325,7 @@ def test_clocks_that_drift_apart_by_more_than_two_milliseconds_a_second_are_refu
         by_rates.synchronise(*record(skew_ppm=skew_ppm))
     assert refused.value.reason_code == "clock_rates_differ"
     assert refused.value.measured["skew_ppm"] == pytest.approx(skew_ppm, abs=15.0)
-    assert "differ by 0.21 %" in refused.value.sentence
-    assert f"the VPS's is the {'fast' if skew_ppm > 0 else 'slow'} one" in refused.value.sentence
+    assert f"differ by 0.21 %, the VPS's is the {'fast' if skew_ppm > 0.0 else 'slow'} one" in refused.value.sentence
 
 
 def test_the_least_peak_is_the_callers() -> None:
@@ -370,7 +369,7 @@ def test_stamps_on_either_clock() -> None:
     """t_vps = (t_imu − ref)(1 + skew) + ref − lag, there and back; the lag at the first sample is on that line."""
     fit = by_rates.SyncFit(
         lag_mid_s=-0.4, skew_ppm=2e5, covariance=np.diag([4e-6, 9e-12]), peak=1.0, runner_up=0.0, peak_width_s=1.0,
-        explained=1.0, matrix=np.eye(3), reference_s=15.0, first_s=10.0,
+        explained=1.0, matrix=np.eye(3), reference_s=15.0, first_s=10.0, turning=np.eye(3),
     )  # fmt: skip
     t = np.array([10.0, 15.0, 20.0])
     vps = (t - 15.0) * 1.2 + 15.0 + 0.4

@@ -27,6 +27,7 @@ from fieldcal.geometry.rotation import (
     from_rotation_vector,
     mean_quaternion,
     multiply,
+    normalise,
     slerp,
     to_rotation_vector,
 )
@@ -38,6 +39,9 @@ REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock
 MOST_GRID_PER_SAMPLE = 20  # a grid over hours of which minutes were recorded fills the memory with gaps
 MIN_EXPLAINED, MAX_SKEW_PPM, MAX_LAG_SD_S = 0.6, 2000.0, 0.01
 SURELY_EXPLAINED = 0.97  # share from which an impossible clock, not another motion, is what differs
+FASTEST_RADPS2 = 50.0  # angular acceleration that may bend the way over a pose
+LEAST_OVERLAP_S = 5.0  # of both records at a lag that is looked at, or half of the shorter one
+SLOW_POSE_S = 0.0125  # poses further apart are interpolated by a cubic: the turn between them is not steady
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,8 @@ class SyncFit:
     `covariance` (2, 2) of the lag at mid-record, s, and the skew (a ratio); `first_s` the first IMU sample.
 
     `explained` is the share of the rates' variance that the VPS accounts for; `peak` and `runner_up` are
-    correlations (the second: best one outside the peak); `matrix` (3, 3) maps VPS body rates to logged rates."""
+    correlations (the second: best one outside the peak); `matrix` (3, 3) maps VPS body rates to logged rates, whose
+    covariance over the record is `turning` (3, 3), (rad/s)²."""
 
     lag_mid_s: float
     skew_ppm: float
@@ -74,6 +79,7 @@ class SyncFit:
     matrix: Array
     reference_s: float
     first_s: float
+    turning: Array
 
     @property
     def lag_s(self) -> float:
@@ -106,7 +112,7 @@ def mask_outliers(t: ArrayLike, q: ArrayLike, *, max_rate: float = 40.0) -> np.n
     """Which VPS attitudes (n, 4) at stamps t to keep, (n,) bool: finite, unit, near their neighbours.
 
     A sample is an outlier when the shortest path over it (before → it → after) is longer than the direct one by more
-    than the motion explains (robust threshold), or implies more than `max_rate` rad/s."""
+    than the motion explains (robust threshold; 50 rad/s² of acceleration), or implies more than `max_rate` rad/s."""
     t, q = np.asarray(t, dtype=float), np.asarray(q, dtype=float)
     keep = np.abs(np.linalg.norm(q, axis=1) - 1.0) < 0.05  # not where one is NaN or infinite
     keep &= np.r_[True, np.diff(t) > 0]
@@ -115,7 +121,9 @@ def mask_outliers(t: ArrayLike, q: ArrayLike, *, max_rate: float = 40.0) -> np.n
         if len(i) < 5:
             return keep
         middle = _deviation(q[i[:-2]], q[i[1:-1]], q[i[2:]], t[i])
-        limit = max(10.0 * robust_sigma(middle), 2e-3)
+        # Between slow poses, or beside a gap, the way is no line where the vehicle speeds up.
+        curved = 0.5 * FASTEST_RADPS2 * (t[i[1:-1]] - t[i[:-2]]) * (t[i[2:]] - t[i[1:-1]])
+        limit = np.maximum(max(10.0 * robust_sigma(middle), 2e-3), curved)
         bad = np.zeros(len(i), dtype=bool)
         bad[1:-1] = middle > limit
         step = np.linalg.norm(to_rotation_vector(multiply(conjugate(q[i[:-1]]), q[i[1:]])), axis=1)
@@ -148,13 +156,20 @@ def vps_rates(t: ArrayLike, q: ArrayLike, interval_s: float, *, max_gap_s: float
     SLERP to the grid, local smoothed differentiation, ω = 2Ξᵀq̇."""
     t, q = np.asarray(t, dtype=float), continuous(q)
     grid = t[0] + interval_s * np.arange(int((t[-1] - t[0]) / interval_s))
-    on_grid = slerp(t, q, grid)
+    on_grid = slerp(t, q, grid) if np.median(np.diff(t)) <= SLOW_POSE_S else cubic(t, q, grid)
     i = interval_of(t, grid)
     valid = (t[i + 1] - t[i]) <= max_gap_s
     # The derivative at a place uses its neighbours: grow the gaps by the window.
     spoiled = np.convolve(~valid, np.ones(9), mode="same") > 0
     rate = body_rate(on_grid, differentiate(on_grid, interval_s))
     return UniformRates(float(t[0]), interval_s, rate, ~spoiled)
+
+
+def cubic(t: Array, q: Array, at: Array) -> Array:
+    """Attitudes (m, 4) at times `at` by a cubic spline through q (n, 4) at t (n,), hemisphere continuous."""
+    from scipy.interpolate import CubicSpline
+
+    return normalise(CubicSpline(t, q)(at))
 
 
 def imu_rates(t: ArrayLike, rate: ArrayLike, interval_s: float, *, max_gap_s: float = 0.1) -> UniformRates:
@@ -168,7 +183,7 @@ def imu_rates(t: ArrayLike, rate: ArrayLike, interval_s: float, *, max_gap_s: fl
 
 
 def correlate(
-    imu: UniformRates, vps: UniformRates, max_lag_s: float, *, min_overlap_s: float = 5.0
+    imu: UniformRates, vps: UniformRates, max_lag_s: float, *, min_overlap_s: float = LEAST_OVERLAP_S
 ) -> tuple[float, float, float, float]:
     """Coarse lag by masked, normalised FFT cross-correlation of rate norms: (lag_s, peak, runner_up, width_s).
 
@@ -218,6 +233,7 @@ def synchronise(
     max_lag_s: float = 60.0,
     min_peak: float = 0.5,
     max_gap_s: float = 0.05,
+    min_overlap_s: float = LEAST_OVERLAP_S,
 ) -> SyncFit:
     """Lag and drift of the VPS clock against the IMU's.
 
@@ -234,11 +250,36 @@ def synchronise(
         `vps_too_short`, `gaps` (hours of pauses for minutes of samples),
         `flat_peak` (peak below `min_peak`), `ambiguous_peak` (runner-up within 2 % of the peak),
         `clock_rates_differ`, `not_the_same_motion` (the vector fit fails at the best lag); `measured` has the numbers.
+        `flat_peak` also where the lag stays uncertain.
 
     Notes
     -----
     The lag contains the difference of the two sensors' group delays. Both sides get the same zero-phase low-pass.
     """
+    imu, vps = on_one_grid(t_imu, rate_imu, t_vps, q_vps, max_gap_s=max_gap_s)
+    lag, peak, runner_up, width = correlate(imu, vps, max_lag_s, min_overlap_s=min_overlap_s)
+    measured = {"peak": peak, "runner_up": runner_up, "peak_width_s": width, "coarse_lag_s": lag}
+    if peak < min_peak:
+        where = f"within vps_max_lag_s = {max_lag_s:g} s" if np.isfinite(max_lag_s) else "at any lag"
+        raise UnusableFlight(
+            ReasonCode.FLAT_PEAK,
+            f"IMU and VPS do not match {where}: their best correlation is {peak:.2f}, below {min_peak:.2f}.",
+            measured,
+        )
+    if runner_up > 0.98 * peak:
+        raise UnusableFlight(
+            ReasonCode.AMBIGUOUS_PEAK,
+            f"Two lags fit about equally well (correlations {peak:.3f} and {runner_up:.3f}): add an unrepeated motion.",
+            measured,
+        )
+    return refined(imu, vps, lag, 0.0, np.asarray(t_imu, dtype=float), measured)
+
+
+def on_one_grid(
+    t_imu: ArrayLike, rate_imu: ArrayLike, t_vps: ArrayLike, q_vps: ArrayLike, *, max_gap_s: float
+) -> tuple[UniformRates, UniformRates]:
+    """Rates of IMU and VPS at the IMU's interval, each on its own clock, low-passed alike. Arguments and errors as
+    `synchronise` has them."""
     t_imu, t_vps = np.asarray(t_imu, dtype=float), np.asarray(t_vps, dtype=float)
     if len(t_vps) < 50 or t_vps[-1] - t_vps[0] < 2.0 or len(t_imu) < 50:
         raise UnusableFlight(
@@ -255,22 +296,24 @@ def synchronise(
         )
     imu = imu_rates(t_imu, rate_imu, interval)
     vps = vps_rates(t_vps, q_vps, interval, max_gap_s=max_gap_s)
-    imu, vps = (_smoothed(s) for s in (imu, vps))
-    lag, peak, runner_up, width = correlate(imu, vps, max_lag_s)
-    measured = {"peak": peak, "runner_up": runner_up, "peak_width_s": width, "coarse_lag_s": lag}
-    if peak < min_peak:
+    imu, vps = _smoothed(imu), _smoothed(vps)
+    if not vps.valid.any():
         raise UnusableFlight(
-            ReasonCode.FLAT_PEAK,
-            f"The best correlation between IMU and VPS is {peak:.2f}, below {min_peak:.2f}: not the same motion.",
-            measured,
+            ReasonCode.VPS_TOO_SHORT,
+            f"The VPS has no stretch without gaps longer than vps_max_gap_s = {max_gap_s:g} s. Raise it if its poses"
+            " come more slowly.",
+            {"n_vps": len(t_vps)},
         )
-    if runner_up > 0.98 * peak:
-        raise UnusableFlight(
-            ReasonCode.AMBIGUOUS_PEAK,
-            f"Two lags fit about equally well (correlations {peak:.3f} and {runner_up:.3f}): add an unrepeated motion.",
-            measured,
-        )
-    fit = _refine(imu, vps, lag, float(t_imu[0]), 0.5 * float(t_imu[0] + t_imu[-1]), measured)
+    return imu, vps
+
+
+def refined(
+    imu: UniformRates, vps: UniformRates, lag_s: float, skew: float, t_imu: Array, measured: dict[str, float]
+) -> SyncFit:
+    """The clock by the vector rates from lag, s at mid-record, and skew (a ratio) nearby; judged. Adds to `measured`.
+
+    Raises UnusableFlight with `clock_rates_differ`, `not_the_same_motion`, `flat_peak`."""
+    fit = _refine(imu, vps, lag_s, float(t_imu[0]), 0.5 * float(t_imu[0] + t_imu[-1]), measured, skew=skew)
     measured |= {"explained": fit.explained, "skew_ppm": fit.skew_ppm, "lag_sd_s": fit.lag_sd_s}
     if fit.explained >= SURELY_EXPLAINED and abs(fit.skew_ppm) > MAX_SKEW_PPM and fit.lag_sd_s <= MAX_LAG_SD_S:
         raise UnusableFlight(
@@ -281,11 +324,18 @@ def synchronise(
             " are wrong on one side, and the gyroscope's scale by as much. Correct them.",
             measured,
         )
-    if fit.explained < MIN_EXPLAINED or abs(fit.skew_ppm) > MAX_SKEW_PPM or fit.lag_sd_s > MAX_LAG_SD_S:
+    if fit.explained < MIN_EXPLAINED or abs(fit.skew_ppm) > MAX_SKEW_PPM:
         raise UnusableFlight(
             ReasonCode.NOT_THE_SAME_MOTION,
             f"At the best lag the VPS explains {100 * fit.explained:.0f} % of the gyroscope's variance, with a clock"
             f" drift of {fit.skew_ppm:.0f} ppm and a lag known to {1e3 * fit.lag_sd_s:.2g} ms: not the same motion.",
+            measured,
+        )
+    if fit.lag_sd_s > MAX_LAG_SD_S:
+        raise UnusableFlight(
+            ReasonCode.FLAT_PEAK,
+            f"The lag between IMU and VPS is known to {1e3 * fit.lag_sd_s:.2g} ms only, where {1e3 * MAX_LAG_SD_S:.0f}"
+            " ms are needed: the motion is too slow, or too little of it is in both records.",
             measured,
         )
     return fit
@@ -302,14 +352,20 @@ def _smoothed(s: UniformRates) -> UniformRates:
 
 
 def _refine(
-    imu: UniformRates, vps: UniformRates, lag: float, first: float, middle: float, measured: dict[str, float]
+    imu: UniformRates,
+    vps: UniformRates,
+    lag: float,
+    first: float,
+    middle: float,
+    measured: dict[str, float],
+    *,
+    skew: float = 0.0,
 ) -> SyncFit:
     """Gauss–Newton for offset, drift and the affine map M, c between the rates, on the IMU's grid."""
     from scipy.interpolate import CubicSpline
 
     spline = CubicSpline(vps.t, vps.rate)
     slope = spline.derivative()
-    skew = 0.0
     t = imu.t
     for _ in range(12):
         # t_vps = (t − middle)(1 + skew) + middle − lag
@@ -348,6 +404,7 @@ def _refine(
         matrix=matrix,
         reference_s=middle,
         first_s=first,
+        turning=np.cov(w.T),
     )
 
 

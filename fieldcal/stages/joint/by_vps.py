@@ -15,12 +15,10 @@ from fieldcal.estimation.by_pose.constant_vector import fit_constant_vector
 from fieldcal.estimation.by_pose.gyroscope import fit_gyroscope, start_by_rates
 from fieldcal.estimation.by_pose.level import mean_in_world, ned_from_world
 from fieldcal.estimation.by_pose.triad import TriadByPose, body_axes
-from fieldcal.estimation.clock_sync import by_rates
 from fieldcal.estimation.joint.fit import JointFit
 from fieldcal.estimation.joint.model_selection import SCORE_CHI2
 from fieldcal.estimation.joint.problem import CROSS, Readings
 from fieldcal.geometry import sensor_model
-from fieldcal.geometry.frames import in_ned
 from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array, body_from_inertial, continuous, slerp, to_rotation_vector
 from fieldcal.names import VECTOR_SENSORS, Json, Sensor
@@ -28,27 +26,13 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import sensor_attitude
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.joint.judgement import MAX_DIP_DIFFERENCE_DEG
-from fieldcal.stages.tables import QUATERNION, matrix, seconds
-from fieldcal.stages.vps import vps_attitude
+from fieldcal.stages.vps_poses import AdmittedPoses, admitted_poses, clock_of
 
 if TYPE_CHECKING:
     from fieldcal.config.stage_settings import JointSettings
 
 # A triad's delay is refined until it changes by less; one that is longer is none, but another motion.
 CONVERGED_DELAY_S, LONGEST_DELAY_S, MOST_DELAY_ROUNDS = 1e-3, 0.5, 6
-POSITION = ("px_m", "py_m", "pz_m")
-
-
-@dataclass(frozen=True)
-class Poses:
-    """VPS stamps (m,), s from the first sample (its epoch `base_s` taken off), attitudes (m, 4) of the sensor axes and
-    positions (m, 3), m, NaN where there is none, both inertial NED; outliers of the attitude masked."""
-
-    t: Array
-    q: Array
-    position: Array
-    base_s: float
-    max_gap_s: float
 
 
 @dataclass(frozen=True)
@@ -64,43 +48,30 @@ class ByVps:
     measured: Mapping[str, Json]
 
 
-def poses_of(tables: Tables, s: JointSettings) -> Poses | None:
-    """The log's VPS, unless `use_vps` is false or there is none."""
+def poses_of(tables: Tables, s: JointSettings) -> AdmittedPoses | None:
+    """The log's VPS as far as it is admitted, unless `use_vps` is false or there is none. Outliers and repeats are told
+    by stage `vps_sync`."""
     if s.use_vps is False or "vps" not in tables or tables["vps"].is_empty():
         return None
-    origin, stamps = int(tables["samples"]["t_ns"][0]), tables["vps"]["t_ns"]
-    base_ns = int(stamps[0]) - origin
-    length_s = (int(tables["samples"]["t_ns"][-1]) - origin) * 1e-9
-    if abs(base_ns) * 1e-9 <= s.vps_max_lag_s + length_s:
-        base_ns = 0
-    t, q = seconds(stamps, origin + base_ns), vps_attitude(matrix(tables["vps"], QUATERNION), s)
-    position = in_ned(matrix(tables["vps"], POSITION), s.world)
-    keep = by_rates.mask_outliers(t, q)
-    return Poses(t[keep], continuous(sensor_attitude(q[keep], s)), position[keep], base_ns * 1e-9, s.vps_max_gap_s)
+    first_ns, last_ns = (int(tables["samples"]["t_ns"][i]) for i in (0, -1))
+    return admitted_poses(tables["vps"], first_ns, (last_ns - first_ns) * 1e-9, s)
 
 
-def gyroscope_by_vps(readings: Readings, poses: Poses, s: JointSettings) -> tuple[JointFit, JointFit]:
+def gyroscope_by_vps(readings: Readings, poses: AdmittedPoses, s: JointSettings) -> tuple[JointFit, JointFit]:
     """`fit_gyroscope` on a flight. Raises UnusableFlight, EstimationError."""
     nominal, polarity = s.nominal_scale[Sensor.GYROSCOPE], s.polarity[Sensor.GYROSCOPE]
     logged = readings.gyroscope
     # A unit has its zero at rest; counts have it near their median.
     zero = np.median(logged, axis=0) if nominal is None else np.zeros(3)
-    unit = np.ones(3) if nominal is None else np.asarray(nominal) * np.asarray(polarity, dtype=float)
-    clock = by_rates.synchronise(
-        readings.t,
-        (logged - zero) * unit,
-        poses.t,
-        poses.q,
-        max_lag_s=s.vps_max_lag_s,
-        min_peak=s.vps_min_peak,
-        max_gap_s=poses.max_gap_s,
-    )
+    unit = (np.ones(3) if nominal is None else np.asarray(nominal)) * np.asarray(polarity, dtype=float)
+    q = continuous(sensor_attitude(poses.q, s))
+    clock = clock_of(poses, readings.t, (logged - zero) * unit, q, s)
     scale, rotation = start_by_rates(clock.matrix / unit[:, None], polarity, nominal)
     start = scale, -scale * zero
-    return fit_gyroscope(readings, poses.t, poses.q, clock, start, rotation, max_gap_s=poses.max_gap_s)
+    return fit_gyroscope(readings, poses.t, q, clock, start, rotation, max_gap_s=poses.max_gap_s)
 
 
-def estimate_by_vps(readings: Readings, poses: Poses, s: JointSettings) -> ByVps:
+def estimate_by_vps(readings: Readings, poses: AdmittedPoses, s: JointSettings) -> ByVps:
     """Everything that the VPS determines. Raises UnusableFlight, EstimationError where it can't give a gyroscope."""
     fit, close = gyroscope_by_vps(readings, poses, s)
     assert close.vps is not None
@@ -146,7 +117,7 @@ def _on_its_own_clock(
     logged: Array,
     readings: Readings,
     fit: JointFit,
-    poses: Poses,
+    poses: AdmittedPoses,
     known: np.ndarray,
     at: Array,
     s: JointSettings,
@@ -171,7 +142,7 @@ def _vector_triad(
     readings: Readings,
     q: Array,
     fit: JointFit,
-    poses: Poses,
+    poses: AdmittedPoses,
     known: np.ndarray,
     at: Array,
     s: JointSettings,
@@ -233,7 +204,7 @@ def _lever_arm(found: TriadByPose, s: JointSettings) -> dict[str, Json]:
     return {"lever_arm_m": (axes @ found.lever_arm_m).tolist(), "lever_arm_sd_m": sd.tolist()}
 
 
-def _measured(fit: JointFit, poses: Poses) -> dict[str, Json]:
+def _measured(fit: JointFit, poses: AdmittedPoses) -> dict[str, Json]:
     vps = fit.vps
     assert vps is not None
     lag, skew = vps.clock_of(fit.state.values)

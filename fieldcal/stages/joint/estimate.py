@@ -27,7 +27,6 @@ from fieldcal.stages.inputs import Tables, is_sound, mean_temperature, reference
 from fieldcal.stages.joint.beside import beside_rows
 from fieldcal.stages.joint.by_vps import (
     ByVps,
-    Poses,
     estimate_by_vps,
     gyroscope_by_vps,
     not_used,
@@ -47,6 +46,7 @@ from fieldcal.stages.tables import (
     seconds,
     triad,
 )
+from fieldcal.stages.vps_poses import AdmittedPoses
 
 if TYPE_CHECKING:
     from fieldcal.config.stage_settings import JointSettings
@@ -103,7 +103,7 @@ def estimate_jointly(tables: Tables, s: JointSettings) -> StageResult:
     return _with_vectors(readings, tables, s, by_vps)
 
 
-def _with_vps(found: ByVps, readings: Readings, tables: Tables, s: JointSettings, poses: Poses) -> StageResult:
+def _with_vps(found: ByVps, readings: Readings, tables: Tables, s: JointSettings, poses: AdmittedPoses) -> StageResult:
     fit, tests = model_selection.add_terms(found.fit)
     triads = {}
     for sensor in chosen(s):
@@ -216,7 +216,7 @@ def _lever_arm(s: JointSettings) -> Array | None:
 
 
 def _held_out(
-    fit: JointFit, readings: Readings, tables: Tables, s: JointSettings, poses: Poses | None
+    fit: JointFit, readings: Readings, tables: Tables, s: JointSettings, poses: AdmittedPoses | None
 ) -> dict[str, pl.DataFrame]:
     """Gyroscope constants from the first part of the flight alone, with `from_ns`, where the rest begins: `verify`
     predicts that. None where the part determines nothing, or another method gives the gyroscope's."""
