@@ -264,7 +264,7 @@ class WarmUpSettings(Units):
 
 
 @dataclass(frozen=True, kw_only=True)
-class VpsReference(Axes, VpsPoses):
+class VpsReference(VpsPoses, Axes):
     """The VPS as a measurement of the joint estimate."""
 
     use_vps: UseVps
