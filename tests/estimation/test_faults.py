@@ -389,6 +389,20 @@ def test_a_coarse_sensor_that_lies_still_is_not_stuck() -> None:
     assert {fault.axis for fault in channel_faults("accelerometer", t, x, "counts", None)} == {"x", "y", "z"}
 
 
+def test_two_steps_of_one_axis_beside_are_still_rest() -> None:
+    """While x stands for 3 s, y moves by two of its steps and z not at all: nothing of a stuck sensor."""
+    rng = np.random.default_rng(4)
+    x = np.cumsum(rng.choice([-1.0, 1.0], size=(4000, 3)), axis=0)
+    hold = slice(2000, 2600)
+    x[hold, 0] = x[2000, 0]
+    x[hold, 1] = x[2000, 1] + np.where(np.arange(600) % 2, 2.0, 0.0)
+    x[hold, 2] = x[2000, 2]
+    t = np.arange(4000) / 200.0
+    assert not [f for f in channel_faults("gyroscope", t, x, "counts", None) if f.axis == "x"]
+    x[hold, 1] = x[2000, 1] + np.where(np.arange(600) % 2, 3.0, 0.0)
+    assert [f.code for f in channel_faults("gyroscope", t, x, "counts", None) if f.axis == "x"] == ["stuck"]
+
+
 def test_values_too_coarse_for_their_motion_are_refused_with_the_step() -> None:
     rng = np.random.default_rng(6)
     t = np.arange(0.0, 30.0, 0.01)

@@ -77,6 +77,15 @@ def test_matrix_bias_and_lever_arm_of_a_closed_form(flown: Flown) -> None:
     assert fit.misfit < 1e-3
 
 
+def test_a_position_with_a_part_missing_is_none(flown: Flown) -> None:
+    part, whole = flown.position.copy(), flown.position.copy()
+    part[1000:1003, 1] = np.nan
+    whole[1000:1003] = np.nan
+    one, other = flown.fitted(position=part), flown.fitted(position=whole)
+    assert one.matrix.tolist() == other.matrix.tolist()
+    assert np.isfinite(one.matrix).all()
+
+
 def test_a_late_sensor_is_told_and_moves_no_constant() -> None:
     fit = Flown(late_s=0.006).fitted()
     assert abs(fit.delay_s - 0.006) < 2e-4
