@@ -86,8 +86,8 @@ class Options:
     """What a fit is made with: a free `dip`, a free `lever_arm`, a VPS, a bound of the walk, `priors` by sensor,
     and colour of the rows over seconds (`slow`)."""
 
-    dip: bool
-    lever_arm: bool
+    dip: bool = True
+    lever_arm: bool = True
     vps: VpsRecord | None = None
     walk_ratio: float = LARGEST_WALK_RATIO
     priors: Mapping[str, PriorConstants] = field(default_factory=dict)
