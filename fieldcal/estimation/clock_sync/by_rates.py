@@ -39,7 +39,7 @@ REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock
 MOST_GRID_PER_SAMPLE = 20  # a grid over hours of which minutes were recorded fills the memory with gaps
 MIN_EXPLAINED, MAX_SKEW_PPM, MAX_LAG_SD_S = 0.6, 2000.0, 0.01
 SURELY_EXPLAINED = 0.97  # share from which an impossible clock, not another motion, is what differs
-FASTEST_RADPS2 = 50.0  # angular acceleration that may bend the way over a pose
+FASTEST_RADPS2 = 40.0  # angular acceleration that may bend the way over a pose
 LEAST_OVERLAP_S = 5.0  # of both records at a lag that is looked at, or half of the shorter one
 SLOW_POSE_S = 0.0125  # poses further apart are interpolated by a cubic: the turn between them is not steady
 
@@ -112,7 +112,7 @@ def mask_outliers(t: ArrayLike, q: ArrayLike, *, max_rate: float = 40.0) -> np.n
     """Which VPS attitudes (n, 4) at stamps t to keep, (n,) bool: finite, unit, near their neighbours.
 
     A sample is an outlier when the shortest path over it (before → it → after) is longer than the direct one by more
-    than the motion explains (robust threshold; 50 rad/s² of acceleration), or implies more than `max_rate` rad/s."""
+    than the motion explains (robust threshold; 40 rad/s² of acceleration), or implies more than `max_rate` rad/s."""
     t, q = np.asarray(t, dtype=float), np.asarray(q, dtype=float)
     keep = np.abs(np.linalg.norm(q, axis=1) - 1.0) < 0.05  # not where one is NaN or infinite
     keep &= np.r_[True, np.diff(t) > 0]
