@@ -85,7 +85,7 @@ def screen(found: Inspection) -> Iterator[str]:
         from fieldcal.flight.first_configuration import vehicle_header
 
         yield ""
-        yield "Unknown or assumed. To settle it, add to this table of fieldcal.toml and correct:"
+        yield "Unknown or assumed; to settle it, put into fieldcal.toml and correct:"
         yield ""
         yield vehicle_header(found.vehicle_id)
         yield from found.settings

@@ -149,6 +149,9 @@ def _entries(archive: Path, uris: list[PurePosixPath]) -> Iterator[str]:
         if not folders:
             yield f"glob = {_quoted(last)}, vehicle = {_quoted(archive.resolve().name or 'vehicle')}"
             continue
+        if len(folders) == 1 and last == "*":  # the session's folder is its one log
+            yield f"glob = {_quoted(escape(str(uri)))}, session = {_quoted(uri.name)}"
+            continue
         own = "/".join([*map(escape, folders), last])
         if len(parents_of[uri.parts[0], uri.parent.name]) > 1:  # 2026/05/11 and 2026/06/11 are two sessions
             yield f"glob = {_quoted(own)}, session = {_quoted('-'.join(folders[1:]) or folders[0])}"
