@@ -127,8 +127,11 @@ def _as_comments(found: Inspection) -> Iterator[str]:
 def _archive_table(archive: Path) -> Iterator[str]:
     """Entries for logs that lie deeper or flatter than `<vehicle>/<session>/<log>`."""
     usual = {log.log_uri for log in find_logs(archive)}
-    all_uris = [uri for uri in _log_uris(archive) if _is_text(uri)]
-    entries = list(dict.fromkeys(_entries(archive, [PurePosixPath(uri) for uri in all_uris if uri not in usual])))
+    elsewhere = [uri for uri in _log_uris(archive) if uri not in usual]
+    named = [PurePosixPath(uri) for uri in elsewhere if _is_text(uri)]
+    if lost := len(elsewhere) - len(named):
+        yield f"# Not found by the night, as folder or name is no UTF-8; rename them: {lost} logs.\n"
+    entries = list(dict.fromkeys(_entries(archive, named)))
     if not entries:
         return
     yield "[archive]  # logs that do not lie as <vehicle>/<session>/<log>; first match counts"
@@ -198,7 +201,8 @@ def _end_of_name(name: str) -> str:
 
 
 def _quoted(text: str) -> str:
-    """As a TOML string, or for a comment: nothing in it ends the line."""
+    """As a TOML string, or for a comment: nothing in it ends the line, and what is no UTF-8 is told by its bytes."""
+    text = text.encode("utf-8", "backslashreplace").decode("utf-8")
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 

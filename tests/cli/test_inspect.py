@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -241,3 +243,28 @@ def test_init_bears_hostile_names_and_logs_that_cannot_be_read(
     told = shown(capsys, "init", str(tmp_path))
     assert set(load(tmp_path / CONFIG_NAME).vehicles) == set(names)
     assert told.count("No log can be read") == len(names)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are UTF-8 there")
+def test_init_bears_names_that_are_no_text(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for place in (b"v/s/log\xff.mcap", b"\xff/s/log.mcap", b"v/s/deeper\xff/log.mcap"):
+        path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + place))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    told = shown(capsys, "init", str(tmp_path))
+    assert load(tmp_path / CONFIG_NAME).vehicles == ("v",)
+    assert told.count("rename") == 2
+
+
+def test_a_date_that_no_field_model_covers_is_told(tmp_path: Path) -> None:
+    log = write_csv(tmp_path / "v" / "s", "t_s,mx,my,mz,ax,ay,az", np.random.default_rng(4).normal(size=(40, 6)))
+    header, *rows = log.read_text().splitlines()
+    in_2005 = [f"{1.12e9 + i / 100:.2f},{row.partition(',')[2]}" for i, row in enumerate(rows)]
+    log.write_text("\n".join([header, *in_2005]) + "\n")
+    (tmp_path / CONFIG_NAME).write_text(f"[defaults]\n{PLACE}\n")
+    found = inspect_log(log)
+    assert found.started_at is not None
+    assert found.started_at.startswith("2005-06-28")
+    assert found.field_used is not None
+    assert found.field_used.north_east_down is None
+    assert "2005" in found.field_used.source
