@@ -14,6 +14,8 @@ import fieldcal
 from fieldcal.cli.config import config_app
 from fieldcal.cli.drift import drift
 from fieldcal.cli.fly import apply, export
+from fieldcal.cli.init import init
+from fieldcal.cli.inspect import inspect
 from fieldcal.cli.interrupt import interruptible
 from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
 from fieldcal.cli.report import report as report_command
@@ -375,6 +377,8 @@ def _assignments(texts: list[str]) -> dict[str, str]:
     return {name.strip(): value.strip() for name, _, value in pairs}
 
 
+app.command(inspect)
+app.command(init)
 app.command(config_app)
 app.command(report_command, name="report")
 app.command(serve)
