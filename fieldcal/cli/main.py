@@ -14,9 +14,8 @@ import fieldcal
 from fieldcal.cli.config import config_app
 from fieldcal.cli.drift import drift
 from fieldcal.cli.fly import apply, export
-from fieldcal.cli.init import init
-from fieldcal.cli.inspect import inspect
 from fieldcal.cli.interrupt import interruptible
+from fieldcal.cli.look import init, inspect
 from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
 from fieldcal.cli.report import report as report_command
 from fieldcal.cli.serve import serve, trigger

@@ -1,4 +1,4 @@
-"""`fieldcal inspect`: what is in a log, on one screen."""
+"""Before the first night: `fieldcal inspect`, what is in a log, and `fieldcal init`, a first fieldcal.toml."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fieldcal.cli.options import AsJson, Config, UnusedRoot
+from fieldcal.cli.options import AsJson, Config, UnusedConfig, UnusedRoot
 
 if TYPE_CHECKING:
     from fieldcal.flight.inspection import Inspection
@@ -37,6 +37,43 @@ def inspect(log: Path, /, *, as_json: AsJson = False, config: Config = None, war
     else:
         print("\n".join(screen(found)))
     return OK if found.verdict == Verdict.OK else LOSSES
+
+
+def init(
+    archive: Path, /, *, as_json: AsJson = False, config: UnusedConfig = None, warehouse: UnusedRoot = None
+) -> int:
+    """Write a commented fieldcal.toml for an archive from what lies in it; one that is there is left as it is.
+
+    Parameters
+    ----------
+    archive
+        Folder of logs.
+    """
+    import shlex
+
+    from fieldcal.cli.show import print_json
+    from fieldcal.flight.first_configuration import first_configuration, write_first_configuration
+    from fieldcal.words.talk import say
+
+    first = first_configuration(archive)
+    if first.logs:
+        write_first_configuration(first)
+    if as_json:
+        told = {"logs": first.logs, "vehicles": first.vehicles}
+        print_json({"file": str(first.path) if first.logs else None, **told, "text": first.text})
+    elif first.logs:
+        print(first.text, end="")
+    if not first.logs:
+        say(
+            f"fieldcal: {archive} holds nothing that is a log by its name (.mcap, .bag, .db3, .ulg, .bin, .csv); "
+            f"nothing was written. fieldcal doctor --archive {shlex.quote(str(archive))} names what lies there."
+        )
+        return LOSSES
+    say(
+        f"Wrote {first.path}: logs found: {first.logs}, vehicles: {first.vehicles}. Fill in what stands in comments, "
+        f"then: fieldcal nightly {shlex.quote(str(archive))} --dry-run"
+    )
+    return OK
 
 
 def screen(found: Inspection) -> Iterator[str]:
