@@ -8,16 +8,16 @@ from datetime import datetime
 import polars as pl
 
 from fieldcal.names import PREFERRED_METHODS, Json, Status, exactness
-from fieldcal.report import flight_evidence
-from fieldcal.report import flight_figures as draw
+from fieldcal.report.figures import flight_evidence
+from fieldcal.report.figures import flight_figures as draw
+from fieldcal.report.figures.flight_quality import spectra, trust
 from fieldcal.report.flight_curves import Curves, curves
 from fieldcal.report.flight_data import FlightData
-from fieldcal.report.flight_quality import spectra, trust
 from fieldcal.report.links import Links, vehicle_name
 from fieldcal.report.page import Column, Folded, Notice, Page, Part, Section, Table, Text, badge
 from fieldcal.report.words import count, day, plain_name, scientific, unit, with_unit
 from fieldcal.schemas.rows import CalibrationRow, FitRow, UnfoldedFlight, UnfoldedRun
-from fieldcal.stages.warm_up import METHOD as WARM_UP
+from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
 from fieldcal.words.flights import QUANTITIES, advised, is_consequence, sync_sentence
 from fieldcal.words.numbers import cell, number
 from fieldcal.words.rows import BESIDE, standing, typed

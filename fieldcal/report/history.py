@@ -10,7 +10,7 @@ import polars as pl
 
 from fieldcal.names import Status
 from fieldcal.report.words import day
-from fieldcal.stages.warm_up import METHOD as WARM_UP
+from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
 from fieldcal.warehouse import Warehouse
 
 

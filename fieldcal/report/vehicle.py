@@ -19,8 +19,8 @@ from fieldcal.report.vehicle_figures import MOST_POINTS, agreement_plot, lag_plo
 from fieldcal.report.words import PARAMETERS, age, count, day, plain_name, preferred, scientific, unit
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.schemas.rows import DriftRow, UnfoldedFlight
-from fieldcal.stages.warm_up import METHOD as WARM_UP
-from fieldcal.stages.warm_up import PARAMETER as WARM_UP_SLOPE
+from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
+from fieldcal.stages.beside.warm_up import PARAMETER as WARM_UP_SLOPE
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.questions import existing
 from fieldcal.words.numbers import number

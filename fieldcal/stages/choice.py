@@ -13,9 +13,9 @@ from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import SENSORS, Approach, Json, Method, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.stages.beside.motor_field import allow_for_motor_field
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.joint.judgement import LARGEST_PRIOR_DISTANCE_SD
-from fieldcal.stages.motor_field import allow_for_motor_field
 from fieldcal.stages.results import StageResult, fatal_fault
 from fieldcal.stages.tables import AXES, calibration_rows, constants, matrix, seconds, triad
 from fieldcal.stages.vps import RATE_COLUMNS, bridged

@@ -42,8 +42,8 @@ from fieldcal.stages import (
     sanity,
     vector_triads,
     vps,
-    warm_up,
 )
+from fieldcal.stages.beside import warm_up
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.joint import estimate
 from fieldcal.stages.results import StageResult

@@ -18,6 +18,7 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import VECTOR_SENSORS, EllipsoidFit, Json, Method, Sensor, Status, Triple
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import logged_constants
+from fieldcal.stages.beside.motor_field import allow_for_motor_field, check_motor_field
 from fieldcal.stages.inputs import (
     Tables,
     differentiate_by_segment,
@@ -26,7 +27,6 @@ from fieldcal.stages.inputs import (
     reference_reading,
     refusal,
 )
-from fieldcal.stages.motor_field import allow_for_motor_field, check_motor_field
 from fieldcal.stages.results import StageResult, fatal_fault, fault_rows, quantity_rows, triad_rows
 from fieldcal.stages.tables import AXES, calibration_rows, constants, covariance_table, matrix, seconds, triad
 

@@ -14,7 +14,7 @@ from fieldcal.estimation.warm_up import SCALE_PER_DEGC_SD
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Status
 from fieldcal.schemas.reference import REFERENCE_DEGC
-from fieldcal.stages.warm_up import CURVE, METHOD, PARAMETER
+from fieldcal.stages.beside.warm_up import CURVE, METHOD, PARAMETER
 from fieldcal.trends.regression import Trends
 from fieldcal.trends.series import Histories
 from fieldcal.trends.temperature_curve import ORDER, Curve, about_reference, combined, of_sessions, together, widening

@@ -7,7 +7,7 @@ import polars as pl
 
 from fieldcal.estimation.warm_up import SCALE_PER_DEGC_SD
 from fieldcal.geometry.rotation import Array
-from fieldcal.stages.warm_up import METHOD, PARAMETER
+from fieldcal.stages.beside.warm_up import METHOD, PARAMETER
 from fieldcal.trends.regression import Trends, pooled
 from fieldcal.trends.series import Histories
 

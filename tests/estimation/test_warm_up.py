@@ -13,10 +13,10 @@ from fieldcal.estimation.warm_up import SCALE_PER_DEGC_SD, fit_resting_accelerom
 from fieldcal.names import Sensor
 from fieldcal.simulation.archive import settings, signals
 from fieldcal.simulation.experiment import SCALE, Experiment, simulate
+from fieldcal.stages.beside.warm_up import find_warm_up
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import triad_rows
 from fieldcal.stages.tables import calibration_rows
-from fieldcal.stages.warm_up import find_warm_up
 
 RATE_HZ = 100.0
 SLOPE = np.array([4.0, -7.0, 0.5])

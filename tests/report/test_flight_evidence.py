@@ -8,10 +8,10 @@ import pytest
 import fieldcal
 from fieldcal.flight.calibrate import identify, read, run_stages
 from fieldcal.names import Sensor
+from fieldcal.report.figures.flight_evidence import Evidence, _by_block, _turn_error, _vector_angle, evidence, methods
+from fieldcal.report.figures.flight_figures import spheres
 from fieldcal.report.flight_curves import counting
 from fieldcal.report.flight_data import FlightData, of_log
-from fieldcal.report.flight_evidence import Evidence, _by_block, _turn_error, _vector_angle, evidence, methods
-from fieldcal.report.flight_figures import spheres
 from fieldcal.report.page import Plot
 
 

@@ -18,7 +18,7 @@ from fieldcal.config.stage_settings import WarmUpSettings
 from fieldcal.estimation.warm_up import fit_warm_up
 from fieldcal.exports.calibration_at import constants_of
 from fieldcal.names import Sensor
-from fieldcal.stages.warm_up import find_warm_up
+from fieldcal.stages.beside.warm_up import find_warm_up
 from fieldcal.trends.drift_table import drift_table, update_drift
 from fieldcal.trends.temperature_curve import Curve, about_reference, combined, of_sessions, together
 from fieldcal.warehouse import Warehouse
