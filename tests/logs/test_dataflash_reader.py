@@ -241,7 +241,9 @@ def test_without_parameters_corrections_are_unknown_and_that_is_told(tmp_path: P
     messages = [one for one in flight.messages() if one.name == "IMU"]
     write.write_dataflash(tmp_path / "a.bin", messages)
     _, summary = tables(tmp_path / "a.bin")
-    assert not source(summary, "gyroscope", "imu").corrected
+    own = source(summary, "gyroscope", "imu")
+    assert own.corrected
+    assert [one.parameters for one in own.corrections] == [{}]
     assert "the log lacks parameters that say how" in sentence(summary, "already_corrected")
 
 
