@@ -20,37 +20,44 @@ import polars as pl
 from numpy.random import Generator
 
 from fieldcal.flight.threads import one_thread
-from fieldcal.names import SENSORS, Sensor, Status
+from fieldcal.geometry.rotation import Array, body_from_inertial, from_rotation_vector
+from fieldcal.names import SENSORS, Rotation, Sensor, Status, Triple
 from fieldcal.simulation.archive import settings, signals
 from fieldcal.simulation.experiment import SimulatedFlight, simulate
-from fieldcal.simulation.faults import Faults, Matrix, with_faults
+from fieldcal.simulation.faults import Faults, with_faults
 from fieldcal.stages.pipeline import run_flight
 
 A, M, G = Sensor.ACCELEROMETER, Sensor.MAGNETOMETER, Sensor.GYROSCOPE
 
 
-def _square(rng: Generator, degrees: float) -> Matrix:
+def _square(rng: Generator, degrees: float) -> Rotation:
     """Axes y and z out of square with x by about so much: lower triangular, so that body axes stay the true ones."""
     a, b, c = np.radians(degrees) * rng.choice([-1.0, 1.0], 3)
     return ((1.0, 0.0, 0.0), (a, 1.0, 0.0), (b, c, 1.0))
 
 
-def _symmetric(rng: Generator, share: float) -> Matrix:
+def _symmetric(rng: Generator, share: float) -> Rotation:
     a, b, c = share * rng.uniform(-1.0, 1.0, 3)
     return ((1.0, a, b), (a, 1.0, c), (b, c, 1.0))
 
 
-def _turned(rng: Generator, degrees: float) -> Matrix:
-    from fieldcal.geometry.rotation import body_from_inertial, from_rotation_vector
-
+def _turned(rng: Generator, degrees: float) -> Rotation:
     axis = rng.normal(size=3)
-    m = body_from_inertial(from_rotation_vector(np.radians(degrees) * axis / np.linalg.norm(axis)))
-    return tuple(tuple(float(v) for v in row) for row in m)  # type: ignore[return-value]
+    return _rows(body_from_inertial(from_rotation_vector(np.radians(degrees) * axis / np.linalg.norm(axis))))
 
 
-def _vector(rng: Generator, length: float) -> tuple[float, float, float]:
+def _vector(rng: Generator, length: float) -> Triple:
     v = rng.normal(size=3)
-    x, y, z = (length * v / np.linalg.norm(v)).tolist()
+    return _triple(length * v / np.linalg.norm(v))
+
+
+def _triple(v: Array) -> Triple:
+    x, y, z = v.tolist()
+    return x, y, z
+
+
+def _rows(m: Array) -> Rotation:
+    x, y, z = (_triple(row) for row in m)
     return x, y, z
 
 
@@ -58,9 +65,8 @@ def _any(rng: Generator) -> Sensor:
     return (A, M, G)[rng.integers(3)]
 
 
-def _sensitivity(rng: Generator) -> Matrix:
-    m = rng.normal(scale=1e-3, size=(3, 3))
-    return tuple(tuple(float(v) for v in row) for row in m)  # type: ignore[return-value]
+def _sensitivity(rng: Generator) -> Rotation:
+    return _rows(rng.normal(scale=1e-3, size=(3, 3)))
 
 
 KINDS: dict[str, Callable[[Generator], Faults]] = {

@@ -235,18 +235,6 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): _WIDTHS,
     (
         "logs.encodings.ros2_cdr",
-        "",
-        '_ENCAPSULATIONS = {0x0000: (">", 8), 0x0100: ("<", 8), 0x0600: (">", 4), 0x0700: ("<", 4)}',
-        "8 → 9",
-    ): "no number is longer than 8 bytes",
-    (
-        "logs.encodings.ros2_cdr",
-        "",
-        '_ENCAPSULATIONS = {0x0000: (">", 8), 0x0100: ("<", 8), 0x0600: (">", 4), 0x0700: ("<", 4)}',
-        "8 → 9 #2",
-    ): "no number is longer than 8 bytes",
-    (
-        "logs.encodings.ros2_cdr",
         "CdrDecoder.decode",
         "kept = np.flatnonzero(sizes >= ENCAPSULATION_BYTES)",
         ">= → >",
@@ -271,20 +259,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): "all parts hold the same values",
     ("logs.csv.dialect", "", "_LINES_LOOKED_AT = 50", "50 → 55"): _LOOKED_AT,
     (
-        "logs.csv.dialect",
-        "find_dialect",
-        'lines = block.split(b"\\n", _LINES_LOOKED_AT * 4)[: _LINES_LOOKED_AT * 4]',
-        "4 → 5",
-    ): _LOOKED_AT,
-    (
-        "logs.csv.dialect",
-        "find_dialect",
-        'lines = block.split(b"\\n", _LINES_LOOKED_AT * 4)[: _LINES_LOOKED_AT * 4]',
-        "4 → 5 #2",
-    ): _LOOKED_AT,
-    ("logs.csv.reader", "", "_LINES_LOOKED_AT = 50", "50 → 55"): _LOOKED_AT,
-    (
-        "logs.csv.rows",
+        "logs.csv.losses",
         "Losses.add",
         "new = lines if last is None else np.setdiff1d(lines, last, assume_unique=True)",
         "True → False",
@@ -567,7 +542,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "1 → 2 #2",
     ): _ANY_NEGATIVE,
     (
-        "logs.mcap.records",
+        "logs.encodings.gather",
         "gather",
         "return values.reshape(-1, count) if count > 1 else values",
         "1 → 2",
@@ -822,24 +797,6 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("estimation.clock_sync.by_rates", "synchronise", "if runner_up > 0.98 * peak:", "> → >="): _NEVER_MET,
     (
         "estimation.clock_sync.by_rates",
-        "synchronise",
-        "if fit.explained < MIN_EXPLAINED or abs(fit.skew_ppm) > MAX_SKEW_PPM or fit.lag_sd_s > MAX_LAG_SD_S:",
-        "< → <=",
-    ): _NEVER_MET,
-    (
-        "estimation.clock_sync.by_rates",
-        "synchronise",
-        "if fit.explained < MIN_EXPLAINED or abs(fit.skew_ppm) > MAX_SKEW_PPM or fit.lag_sd_s > MAX_LAG_SD_S:",
-        "> → >=",
-    ): _NEVER_MET,
-    (
-        "estimation.clock_sync.by_rates",
-        "synchronise",
-        "if fit.explained < MIN_EXPLAINED or abs(fit.skew_ppm) > MAX_SKEW_PPM or fit.lag_sd_s > MAX_LAG_SD_S:",
-        "> → >= #2",
-    ): _NEVER_MET,
-    (
-        "estimation.clock_sync.by_rates",
         "_refine",
         "inside = (nearest >= 1) & (nearest < len(vps.rate) - 1) & imu.valid",
         ">= → >",
@@ -936,12 +893,6 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         'n_temperatures = self._signals["temperature"].rows if self._temperature else 1',
         "1 → 2",
     ): "where there is no temperature it divides nothing",
-    (
-        "logs.csv.reader",
-        "CsvTable._times",
-        "t_ns = times.fill_null(0).to_numpy()",
-        "0 → 1",
-    ): "rows whose time is unsound are left out",
     (
         "estimation.clock_sync.by_rates",
         "mask_outliers",

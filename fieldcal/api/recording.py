@@ -163,7 +163,8 @@ def read_log(path: Path | str, *, config: Path | str | None = None, vehicle: str
     Parameters
     ----------
     path : Path or str
-        An MCAP, ULog or CSV file, or a folder with imu.csv; its vehicle and session are the folders it lies in,
+        An MCAP, ROS bag (file or folder), ULog, DataFlash or CSV file, or a folder with imu.csv; its vehicle and
+        session are the folders it lies in,
         ``<vehicle>/<session>/<log>``.
     config : Path or str, optional
         A fieldcal.toml: topics, columns, units. Otherwise the one in the folder above the vehicle's, if there is one.

@@ -67,7 +67,7 @@ def apply(
     Parameters
     ----------
     log
-        An MCAP, ULog or CSV file, or a folder with imu.csv.
+        A log: MCAP, ROS bag (file or folder), PX4 ULog, ArduPilot .bin or CSV, or a folder with imu.csv.
     output
         NAME.mcap: ROS 2 Imu and MagneticField in body axes (REP-103). Anything else: a folder for imu.parquet and
         magnetometer.parquet, in the sensor axes as logged.

@@ -77,7 +77,7 @@ def calibrate(
     Parameters
     ----------
     log
-        An MCAP, ULog or CSV file, or a folder with imu.csv.
+        A log: MCAP, ROS bag (file or folder), PX4 ULog, ArduPilot .bin or CSV, or a folder with imu.csv.
     vehicle
         The vehicle in fieldcal.toml; else the folder two levels above the log.
     method

@@ -15,6 +15,11 @@ from fieldcal.reason_codes import ReasonCode
 UNIT_IN_TESLA = {"T": 1.0, "uT": 1e-6, "G": 1e-4}
 
 
+def dip_rad(field: Array) -> float:
+    """Dip of a field (3,), north, east, down (or level, level, down): its angle below the horizon, rad."""
+    return float(np.arctan2(field[2], np.hypot(field[0], field[1])))
+
+
 class _Field(Protocol):
     """North, east, down; nanotesla."""
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldcal.logs.interface import Columns, LogSummary, SensorSource
+from fieldcal.logs.joining import imu_columns
 from fieldcal.reason_codes import ReasonCode
 
 MOST_INTERVALS_APART = 2.5
@@ -70,16 +71,6 @@ def join_on_gyroscope(
         int(np.count_nonzero(inside & ~kept)),
         int(np.count_nonzero(~inside)),
     )
-
-
-def imu_columns(t_ns: NDArray[np.int64], gyroscope: NDArray[np.float64], accelerometer: NDArray[np.float64]) -> Columns:
-    """Columns of table "imu"."""
-    return {"t_ns": t_ns, **triad("gyroscope", gyroscope), **triad("accelerometer", accelerometer)}
-
-
-def triad(sensor: str, values: NDArray[np.float64]) -> Columns:
-    """The three columns of a sensor from (n, 3) readings."""
-    return {f"{sensor}_{axis}": np.ascontiguousarray(values[:, i], np.float64) for i, axis in enumerate("xyz")}
 
 
 def tell_join(

@@ -24,6 +24,16 @@ def stand_apart(gyroscope: NDArray[np.bool_], accelerometer: NDArray[np.bool_]) 
     return fewer >= LEAST_ROWS and both < SHARED * either
 
 
+def imu_columns(t_ns: NDArray[np.int64], gyroscope: NDArray[np.float64], accelerometer: NDArray[np.float64]) -> Columns:
+    """Columns of table "imu"."""
+    return {"t_ns": t_ns, **triad("gyroscope", gyroscope), **triad("accelerometer", accelerometer)}
+
+
+def triad(sensor: str, values: NDArray[np.float64]) -> Columns:
+    """The three columns of a sensor from (n, 3) readings."""
+    return {f"{sensor}_{axis}": np.ascontiguousarray(values[:, i], np.float64) for i, axis in enumerate("xyz")}
+
+
 class SensorJoin:
     """Readings of the two sensors being gathered; `joined` gives the rows of table imu."""
 
@@ -54,9 +64,6 @@ class SensorJoin:
         t_ns, rates, i = t_ns[near], rates[near], i[near]
         share = ((t_ns - at_ns[i]) / (at_ns[i + 1] - at_ns[i]))[:, None]
         between = (1.0 - share) * forces[i] + share * forces[i + 1]
-        columns: Columns = {"t_ns": t_ns}
-        for sensor, readings in zip(INERTIAL, (rates, between), strict=True):
-            columns |= {f"{sensor}_{axis}": readings[:, k].copy() for k, axis in enumerate("xyz")}
         finding = Finding(
             ReasonCode.SENSORS_JOINED,
             len(t_ns),
@@ -66,7 +73,7 @@ class SensorJoin:
             "readings about them were left out.",
             loses_data=in_pauses > 0,
         )
-        return columns, finding
+        return imu_columns(t_ns, rates, between), finding
 
     def _whole(self, sensor: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         stamps, readings = zip(*self._gathered[sensor], strict=True)

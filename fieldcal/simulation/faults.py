@@ -9,10 +9,8 @@ import numpy as np
 from numpy.random import Generator
 
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import Sensor
+from fieldcal.names import Rotation, Sensor, Triple
 from fieldcal.simulation.experiment import SimulatedFlight, constants_at
-
-Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass(frozen=True)
@@ -28,15 +26,15 @@ class Faults:
     place of the next.
     """
 
-    matrix: Mapping[Sensor, Matrix] = field(default_factory=dict)
+    matrix: Mapping[Sensor, Rotation] = field(default_factory=dict)
     delay_s: Mapping[Sensor, float] = field(default_factory=dict)
     held_hz: Mapping[Sensor, float] = field(default_factory=dict)
     step: Mapping[Sensor, float] = field(default_factory=dict)
-    g_sensitivity: Matrix | None = None
+    g_sensitivity: Rotation | None = None
     nonlinearity: float = 0.0
     rate_error: float = 0.0
-    field_per_ampere: tuple[float, float, float] | None = None
-    hard_iron_step: tuple[float, float, float] | None = None
+    field_per_ampere: Triple | None = None
+    hard_iron_step: Triple | None = None
     repeated_s: float = 0.0
 
     def true_scale(self, flight: SimulatedFlight, sensor: Sensor) -> Array:

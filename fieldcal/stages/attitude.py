@@ -96,6 +96,12 @@ def local_field(vectors: Array, s: FieldOrigin) -> Array:
     return float(np.linalg.norm(s.field_ned)) * np.array([np.cos(dip), 0.0, np.sin(dip)])
 
 
+def reference_vectors(vectors: Array, s: FieldOrigin) -> tuple[Array, float]:
+    """What calibrated vectors (n, 2, 3) are compared with: field and vertical (2, 3), NED, and the declination, rad."""
+    field = local_field(vectors, s)
+    return np.array([field, [0.0, 0.0, 1.0]]), float(np.arctan2(field[1], field[0]))
+
+
 def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
     """samples and both triads' constants → attitude (Eq. 9), weighted by the errors of the measured lengths.
 
@@ -123,9 +129,7 @@ def estimate_attitude(tables: Tables, s: AttitudeSettings) -> StageResult:
     field_excess = np.linalg.norm(vectors[:, 0], axis=1) / strength - 1.0
     acceleration_excess = np.linalg.norm(vectors[:, 1], axis=1) / gravity - 1.0
     sigma = np.array([spread_of(field_excess), spread_of(acceleration_excess)])
-    field = local_field(vectors, s)
-    reference = np.array([field, [0.0, 0.0, 1.0]])
-    declination = float(np.arctan2(field[1], field[0]))
+    reference, declination = reference_vectors(vectors, s)
     fit = wahba.attitudes(vectors, reference, sigma, method=s.attitude, declination=declination)
     weight = 1.0 / (1.0 + (acceleration_excess / TRUST_ACCELERATION) ** 2 + (field_excess / TRUST_FIELD) ** 2)
     dip = _dip_deg(vectors)[weight >= np.quantile(weight, 1.0 - TRUSTED_SHARE)]

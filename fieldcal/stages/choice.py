@@ -87,10 +87,8 @@ def _implausible(rows: pl.DataFrame, s: ChoiceSettings) -> pl.DataFrame:
         scales = rows.filter(sensor=sensor, parameter="scale").filter(pl.col("axis").is_in(AXES))
         for (method,), own in scales.partition_by("method", as_dict=True).items():
             size = np.abs([nominal[AXES.index(axis)] for axis in own["axis"]])
-            off = np.abs(own["value"].to_numpy() / size) - 1.0
-            sd = own["sd"].to_numpy() / size
-            known = LARGEST_PRIOR_DISTANCE_SD * s.prior_scale_sd + LARGEST_PRIOR_DISTANCE_SD * sd
-            if np.any(np.abs(off) > known):
+            off = np.abs(np.abs(own["value"].to_numpy() / size) - 1.0)
+            if np.any(off > LARGEST_PRIOR_DISTANCE_SD * (s.prior_scale_sd + own["sd"].to_numpy() / size)):
                 rows = _refused(rows, sensor, [str(method)], None, ReasonCode.PRIOR_CONTRADICTED)
     return rows
 

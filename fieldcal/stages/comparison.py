@@ -17,7 +17,7 @@ from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, continuous, slerp
 from fieldcal.names import Method, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.stages.attitude import body_vectors, known_vectors, local_field, sensor_attitude
+from fieldcal.stages.attitude import body_vectors, known_vectors, reference_vectors, sensor_attitude
 from fieldcal.stages.inputs import Tables, differentiate_by_segment, spread_of
 from fieldcal.stages.results import StageResult
 from fieldcal.stages.tables import QUATERNION, constants, matrix, seconds, triad
@@ -143,9 +143,7 @@ def _raw_attitude(tables: Tables, s: VerifySettings) -> Array:
     vectors = body_vectors(tables["samples"], known_vectors(tables, s), s, prefix="")
     lengths = np.linalg.norm(vectors, axis=2) / np.array([np.linalg.norm(s.field_ned), s.gravity_mps2])
     sigma = np.array([spread_of(lengths[:, 0]), spread_of(lengths[:, 1])])
-    field = local_field(vectors, s)
-    reference = np.array([field, [0.0, 0.0, 1.0]])
-    declination = float(np.arctan2(field[1], field[0]))
+    reference, declination = reference_vectors(vectors, s)
     return wahba.attitudes(vectors, reference, sigma, method=s.attitude, declination=declination).q
 
 

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from fieldcal.config.stage_settings import CompositionSettings
 
 COMPOSED = ("scale", "bias", "zero", "zero_bias")
+SQUARE = 1e-9
+"""Off-diagonal share of a matrix that is rounding."""
 
 
 def compose(tables: Tables, s: CompositionSettings) -> StageResult:
@@ -107,10 +109,6 @@ def _of_raw(rows: pl.DataFrame, p: Array, o: Array, p_sd: float, o_sd: Array) ->
             names = [_copied(scales[i], axis + other) for other in AXES]
             out += _with(names, raw_scale[i], raw_scale_sd[i])
     return calibration_rows(out + others)
-
-
-SQUARE = 1e-9
-"""Off-diagonal share of a matrix that is rounding."""
 
 
 def _through(matrix: Array, v: Array) -> Array:

@@ -11,7 +11,7 @@ import pytest
 from fieldcal.names import SENSORS
 from fieldcal.simulation.archive import settings, signals, truth
 from fieldcal.simulation.experiment import SimulatedFlight, simulate
-from fieldcal.stages.joint.estimate import each_once
+from fieldcal.stages.joint.readings import each_once
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.stages.results import StageResult
 

@@ -17,6 +17,7 @@ from fieldcal.estimation.joint.chain_solver import STATES, place_knots
 from fieldcal.estimation.joint.problem import Model, Readings, State, averaging_side
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.smoothing import differentiate_samples, fill, lattice, smooth_samples
+from fieldcal.geometry.earth_field import dip_rad
 from fieldcal.geometry.rotation import (
     Array,
     angle_between,
@@ -110,7 +111,10 @@ def prepare(
     knots = place_knots(readings.t, readings.segment, KNOT_SPACING_S)
     rate = np.sqrt(np.mean(np.sum((gyro[0] * readings.turning[0] + gyro[1]) ** 2, axis=1)))
     model = Model.of(readings, knots, side=averaging_side(readings, 3.0 * float(rate)))
-    values = {"dip": np.array([_dip(readings.field_ned)]), "lever_arm": np.zeros(3) if lever_arm is None else lever_arm}
+    values = {
+        "dip": np.array([dip_rad(readings.field_ned)]),
+        "lever_arm": np.zeros(3) if lever_arm is None else lever_arm,
+    }
     for name, start in {**vectors, "gyroscope": gyro}.items():
         if name in model.triads and start is not None:
             values[name] = model.triads[name].scaled(*start)
@@ -124,10 +128,6 @@ def anew(model: Model, state: State) -> State:
     vectors = {name: constants.get(name) for name in ("accelerometer", "magnetometer")}
     q, _ = _start_attitude(model.readings, vectors, constants["gyroscope"])
     return State(q[model.knots.index], np.zeros_like(state.motion), state.values)
-
-
-def _dip(field_ned: Array) -> float:
-    return float(np.arctan2(field_ned[2], np.hypot(field_ned[0], field_ned[1])))
 
 
 def _start_attitude(

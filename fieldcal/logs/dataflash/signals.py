@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldcal.geometry.rotation import from_euler
-from fieldcal.logs.autopilot import imu_columns, triad
 from fieldcal.logs.dataflash.clock import LEAST_FIX, sampled_ns, stamps_ns
 from fieldcal.logs.dataflash.file import DataflashFile
 from fieldcal.logs.dataflash.records import Rows
 from fieldcal.logs.interface import Columns
+from fieldcal.logs.joining import imu_columns, triad
 
 PIECE_ROWS = 1 << 16
 """Rows of a batch."""

@@ -11,7 +11,7 @@ from fieldcal.config.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.encodings.decoded import COMPONENTS, Decoded
 from fieldcal.logs.interface import Batch, Columns, LogSummary, logged_units, stamps_are_epoch
-from fieldcal.logs.joining import INERTIAL, SensorJoin
+from fieldcal.logs.joining import INERTIAL, SensorJoin, triad
 from fieldcal.logs.messages.container import Block, Container
 from fieldcal.logs.messages.frames import STAMPED_TYPES, of_frame
 from fieldcal.logs.messages.packed import PackedPayloads
@@ -191,8 +191,7 @@ def _of_channel(block: Block, channel_id: int) -> Block:
 def _columns(t_ns: NDArray[np.int64], values: dict[str, NDArray[np.float64]], sensors: Sequence[str]) -> Columns:
     columns: Columns = {"t_ns": t_ns}
     for sensor in sensors:
-        for number, component in enumerate(COMPONENTS[3]):
-            columns[f"{sensor}_{component}"] = values[sensor][:, number].copy()
+        columns |= triad(sensor, values[sensor])
     return columns
 
 

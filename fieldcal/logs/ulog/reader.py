@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from fieldcal.config.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
-from fieldcal.logs.autopilot import Joined, imu_columns, tell_join, tell_simulated, tell_sources, triad, unit_ids
+from fieldcal.logs.autopilot import Joined, tell_join, tell_simulated, tell_sources, unit_ids
 from fieldcal.logs.interface import Batch, Columns, Correction, LogSummary, SensorSource, logged_units
+from fieldcal.logs.joining import imu_columns, triad
 from fieldcal.logs.ulog import aids
 from fieldcal.logs.ulog.file import UlogFile
 from fieldcal.logs.ulog.parameters import BOARD, History, corrections

@@ -19,6 +19,7 @@ from fieldcal.estimation.joint.fit import JointFit
 from fieldcal.estimation.joint.model_selection import SCORE_CHI2
 from fieldcal.estimation.joint.problem import CROSS, Readings
 from fieldcal.geometry import sensor_model
+from fieldcal.geometry.earth_field import dip_rad
 from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array, body_from_inertial, continuous, slerp, to_rotation_vector
 from fieldcal.names import VECTOR_SENSORS, Json, Sensor
@@ -171,8 +172,8 @@ def _vector_triad(
         found, vector, _ = fit_constant_vector(
             readings.t, readings.segment, logged, q, known, length=length, polarity=s.polarity[sensor]
         )
-        down = _dip_deg(vector)
-        expected = _dip_deg(readings.field_ned)
+        down = float(np.degrees(dip_rad(vector)))
+        expected = float(np.degrees(dip_rad(readings.field_ned)))
         if sensor == Sensor.MAGNETOMETER and abs(down - expected) > MAX_DIP_DIFFERENCE_DEG:
             raise UnusableFlight(
                 ReasonCode.FIELD_CONTRADICTED,
@@ -189,10 +190,6 @@ def _vector_triad(
         "mean_robust_weight": float(found.weight.mean()),
     }
     return found, numbers
-
-
-def _dip_deg(field: Array) -> float:
-    return float(np.degrees(np.arctan2(field[2], np.hypot(field[0], field[1]))))
 
 
 def _lever_arm(found: TriadByPose, s: JointSettings) -> dict[str, Json]:

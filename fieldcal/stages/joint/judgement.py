@@ -9,6 +9,7 @@ from fieldcal.estimation.joint.covariance import advice
 from fieldcal.estimation.joint.fit import JointFit
 from fieldcal.estimation.joint.measurement_model import body_jumps
 from fieldcal.estimation.joint.problem import PriorConstants
+from fieldcal.geometry.earth_field import dip_rad
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import SENSORS, Json, Sensor
 from fieldcal.reason_codes import ReasonCode
@@ -87,8 +88,7 @@ def dip_contradicts(fit: JointFit) -> ReasonCode | None:
     """Why the angle between field and gravity can't be that of the configured place, or None; where it is estimated."""
     if "dip" not in fit.layout:
         return None
-    north, east, down = fit.model.readings.field_ned
-    found, expected = fit.state.values["dip"][0], np.arctan2(down, np.hypot(north, east))
+    found, expected = fit.state.values["dip"][0], dip_rad(fit.model.readings.field_ned)
     off = np.degrees(np.abs(np.angle(np.exp(1j * (found - np.array([expected, -expected]))))))
     if off[0] <= MAX_DIP_DIFFERENCE_DEG:
         return None
