@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
-
-import polars as pl
 
 from fieldcal.cli.present_night import print_night
 from fieldcal.cli.progress import NightProgress
 from fieldcal.cli.show import console, table
 from fieldcal.flows.run import run_night
-from fieldcal.names import SENSORS
+from fieldcal.names import SENSORS, Status, exactness
 from fieldcal.schemas.rows import CalibrationRow
 from fieldcal.simulation.archive import Truth, write_flights
 from fieldcal.simulation.experiment import Experiment
+from fieldcal.stages.tables import AXES
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.numbers import number, with_sd
 from fieldcal.words.rows import typed
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 VEHICLES, SESSIONS, FLIGHTS = 2, 2, 1
 PARAMETERS: tuple[Literal["scale", "zero"], ...] = ("scale", "zero")
-BEST_METHODS = {"magnetometer": "ellipsoid_robust", "accelerometer": "ellipsoid_robust", "gyroscope": "output_error"}
 QUESTIONS = (
     "SELECT vehicle_id, sensor, axis, value_at_25degc, sd FROM latest_calibration WHERE parameter = 'scale'",
     "SELECT log_uri, quantity, method, reference, tic, rms, rms_unit FROM worst_tic LIMIT 10",
@@ -47,31 +46,29 @@ def run_demo(folder: Path, root: Path, config: Path | None) -> bool:
     uri = logs[0].relative_to(archive).as_posix()
     truth: Truth = json.loads(logs[0].with_name(logs[0].stem + ".truth.json").read_text(encoding="utf-8"))
     flight = next(log["flight_id"] for log in result["logs"] if log["log_uri"] == uri)
-    out.print(_beside_truth(root, flight, truth, uri))
+    stored = Warehouse(root).scan("calibration", flight_id=flight).collect()
+    out.print(beside_truth(list(typed(stored.iter_rows(named=True), CalibrationRow)), truth, uri))
     out.print("Ask next:", markup=False)
     for question in QUESTIONS:
         out.print(f'  fieldcal sql --warehouse {root} "{question}"', markup=False, soft_wrap=True)
     return bool(result["ok"] != len(result["logs"]))
 
 
-def _beside_truth(root: Path, flight_id: str, truth: Truth, uri: str) -> Table:
-    """Scale and zero of one flight, with sd, the truth, and the error in sd and per cent."""
-    rows = Warehouse(root).scan("calibration", flight_id=flight_id).filter(pl.col("parameter").is_in(["scale", "zero"]))
-    found = {
-        (row["sensor"], row["method"], row["parameter"], row["axis"]): row
-        for row in typed(rows.collect().iter_rows(named=True), CalibrationRow)
-    }
+def beside_truth(rows: Sequence[CalibrationRow], truth: Truth, uri: str) -> Table:
+    """Scale and zero of one flight, by the method that counts, with sd, the truth, and the error in sd and per cent."""
+    counting = sorted((row for row in rows if row["status"] == Status.OK), key=lambda row: -exactness(row["method"]))
+    found = {(row["sensor"], row["parameter"], row["axis"]): row for row in counting}
     lines = []
     for sensor in SENSORS:
-        for i, axis in enumerate("xyz"):
+        for i, axis in enumerate(AXES):
             for parameter in PARAMETERS:
-                row = found.get((sensor, BEST_METHODS[sensor], parameter, axis))
+                row = found.get((sensor, parameter, axis))
                 true = truth["constants"][sensor][parameter][i]
                 if row is not None and row["value"] is not None:
                     value, sd = row["value"], row["sd"]
                     found_and_true = (with_sd(value, sd), number(true, 6), *_error(value, sd, true))
-                    lines.append([sensor, parameter, axis, *found_and_true])
-    columns = ["sensor", "parameter", "axis", "found", "truth", "error %", "error in sd"]
+                    lines.append([sensor, row["method"], parameter, axis, *found_and_true])
+    columns = ["sensor", "method", "parameter", "axis", "found", "truth", "error %", "error in sd"]
     return table(columns, lines, f"{uri} beside the truth of the simulation")
 
 
