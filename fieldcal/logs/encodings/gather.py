@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
+T = TypeVar("T", bound=np.generic)
 
-def gather(data: NDArray[np.uint8], offsets: NDArray[np.int64], dtype: np.dtype, count: int = 1) -> NDArray:  # type: ignore[type-arg]
+
+def gather(data: NDArray[np.uint8], offsets: NDArray[np.int64], dtype: np.dtype[T], count: int = 1) -> NDArray[T]:
     """Values of `dtype` lying at byte `offsets` of `data`: shape (n,), or (n, count) when `count` > 1.
 
     The caller has checked that every offset leaves room for the value.
