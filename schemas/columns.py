@@ -152,6 +152,14 @@ FLIGHT_ID = Column(
 )
 VEHICLE_ID = Column("vehicle_id", _TEXT, "", "vehicle that flew (`drift`: the latest one that carried the IMU)")
 IMU_ID = Column("imu_id", _TEXT, "", "inertial unit on board; the vehicle's id where no other is configured")
+UNIT_ID = Column(
+    "unit_id",
+    _TEXT,
+    "",
+    "the unit whose constants these are (of an agreement, a clock, a stage: that it is about): board, then the device "
+    "id, frame or instance that tells it from others on board; the imu_id where the log tells of one alone",
+)
+IS_PRIMARY = Column("is_primary", _FLAG, "", "whether it was the flight's primary unit, by which the vehicle flew")
 SESSION_ID = Column("session_id", _TEXT, "", "field session of the flight: the folder the log lay in")
 STARTED_AT = Column(
     "started_at",

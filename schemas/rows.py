@@ -57,7 +57,14 @@ class UnfoldedFlight(_FlightFacts):
     findings: list[Finding] | None
 
 
-class CalibrationRow(FlightLead):
+class UnitLead(FlightLead):
+    """What leads every row that speaks of one unit of a flight."""
+
+    unit_id: str
+    is_primary: bool
+
+
+class CalibrationRow(UnitLead):
     """A row of `calibration`."""
 
     sensor: str
@@ -73,7 +80,7 @@ class CalibrationRow(FlightLead):
     run_key: str | None
 
 
-class FitRow(FlightLead):
+class FitRow(UnitLead):
     """A row of `fit`."""
 
     quantity: str
@@ -91,7 +98,7 @@ class FitRow(FlightLead):
     run_key: str | None
 
 
-class SyncRow(FlightLead):
+class SyncRow(UnitLead):
     """A row of `sync`."""
 
     lag_s: float | None
@@ -113,7 +120,7 @@ class Refusable(TypedDict):
     reason_code: str | None
 
 
-class _StageRun(FlightLead, Refusable):
+class _StageRun(UnitLead, Refusable):
     run_key: str | None
 
 
@@ -136,6 +143,7 @@ class DriftRow(TypedDict):
 
     vehicle_id: str
     imu_id: str
+    unit_id: str
     sensor: str
     method: str
     parameter: str
@@ -187,6 +195,10 @@ ROWS = {
     "run": RunRow,
     "drift": DriftRow,
 }
+
+
+UNIT_OF_OLDER_ROWS = "imu_id"
+"""Rows of a version without `unit_id` are of the one unit that a flight had then, the primary one: its imu_id."""
 
 
 def may_be_null(table: str) -> frozenset[str]:

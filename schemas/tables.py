@@ -19,6 +19,8 @@ _CONSTANTS = (
     c.REASON_CODE,
 )
 """A calibrated parameter of one axis."""
+_UNIT = (c.UNIT_ID, c.IS_PRIMARY)
+"""Which of the units on board a row of the history is about."""
 
 _SIGNALS = (
     Table(
@@ -170,18 +172,19 @@ _HISTORY = (
     Table(
         "calibration",
         "history",
-        1,
-        "one row a sensor, method, parameter and axis of a flight",
-        (*c.LEAD, *_CONSTANTS, c.RUN_KEY),
-        ("flight_id", "sensor", "method", "parameter", "axis"),
+        2,
+        "one row a unit, sensor, method, parameter and axis of a flight",
+        (*c.LEAD, *_UNIT, *_CONSTANTS, c.RUN_KEY),
+        ("flight_id", "unit_id", "sensor", "method", "parameter", "axis"),
     ),
     Table(
         "fit",
         "history",
-        1,
-        "one row a quantity, method and reference of a flight: how well they agree",
+        2,
+        "one row a unit, quantity, method and reference of a flight: how well they agree",
         (
             *c.LEAD,
+            *_UNIT,
             c.QUANTITY,
             c.METHOD,
             c.REFERENCE,
@@ -196,15 +199,16 @@ _HISTORY = (
             c.N_SAMPLES,
             c.RUN_KEY,
         ),
-        ("flight_id", "quantity", "method", "reference", "signal", "sample"),
+        ("flight_id", "unit_id", "quantity", "method", "reference", "signal", "sample"),
     ),
     Table(
         "sync",
         "history",
-        1,
-        "one row a flight with VPS: its clock against the IMU's",
+        2,
+        "one row a unit of a flight with VPS: the VPS's clock against the IMU's",
         (
             *c.LEAD,
+            *_UNIT,
             c.LAG_S,
             c.LAG_MID_S,
             c.LAG_SD_S,
@@ -215,24 +219,25 @@ _HISTORY = (
             c.STATUS,
             c.RUN_KEY,
         ),
-        _HISTORY_FLIGHT_KEY,
+        ("flight_id", "unit_id"),
     ),
     Table(
         "run",
         "history",
-        1,
-        "one row a stage of a flight: the execution that made the result",
-        (*c.LEAD, c.STAGE, c.STATUS, c.REASON_CODE, c.MEASURED, c.RUN_KEY, c.VERSIONS),
-        ("flight_id", "stage"),
+        2,
+        "one row a unit and stage of a flight: the execution that made the result",
+        (*c.LEAD, *_UNIT, c.STAGE, c.STATUS, c.REASON_CODE, c.MEASURED, c.RUN_KEY, c.VERSIONS),
+        ("flight_id", "unit_id", "stage"),
     ),
     Table(
         "drift",
         "history",
-        3,
-        "one row an IMU, sensor, method, parameter and axis: trend over temperature and time",
+        4,
+        "one row a unit, sensor, method, parameter and axis: trend over temperature and time",
         (
             c.VEHICLE_ID,
             c.IMU_ID,
+            c.UNIT_ID,
             c.SENSOR,
             c.METHOD,
             c.PARAMETER,
@@ -265,7 +270,7 @@ _HISTORY = (
             c.CURVE_PER_DEGC3,
             c.CURVE_PER_DEGC3_SD,
         ),
-        ("imu_id", "sensor", "method", "parameter", "axis"),
+        ("unit_id", "sensor", "method", "parameter", "axis"),
     ),
 )
 
@@ -274,7 +279,10 @@ SIGNAL_TABLES = tuple(table.name for table in _SIGNALS)
 STAGE_TABLES = tuple(table.name for table in _STAGES)
 HISTORY_TABLES = tuple(table.name for table in _HISTORY)
 
-_NOT_AT_STAGE_LEVEL = frozenset(column.name for column in (*c.LEAD, c.RUN_KEY))
+UNITS_APART = "."
+"""Between a signal's name and the number of a further unit on board: "imu.1"."""
+
+_NOT_AT_STAGE_LEVEL = frozenset(column.name for column in (*c.LEAD, *_UNIT, c.RUN_KEY))
 _AT_STAGE_LEVEL = ("calibration", "fit", "sync")
 
 
@@ -294,6 +302,12 @@ def table_columns(table: str, *, stage: bool = False) -> tuple[Column, ...]:
     if table not in _AT_STAGE_LEVEL:
         raise KeyError(f"no stage writes the table {table!r}")
     return tuple(column for column in definition.columns if column.name not in _NOT_AT_STAGE_LEVEL)
+
+
+def signal_kind(table: str) -> str:
+    """The signal table whose columns readings have: "imu" of "imu.1", the readings of a further unit on board."""
+    kind, _, number = table.partition(UNITS_APART)
+    return kind if number.isascii() and number.isdigit() else table
 
 
 def table_key(table: str, *, stage: bool = False) -> tuple[str, ...]:

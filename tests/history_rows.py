@@ -13,11 +13,12 @@ START = dt.datetime(2026, 5, 4, 12, 0, tzinfo=dt.UTC)
 
 
 def rows(table: str, *records: dict[str, Any]) -> pl.DataFrame:
-    """A frame of `table` with these values; what a record does not name is null."""
+    """A frame of `table` with these values; what a record does not name is null, its unit the primary one, alone."""
     empty = pl.from_arrow(schemas.arrow_schema(table).empty_table())
     assert isinstance(empty, pl.DataFrame)
     names = schemas.TABLES[table].column_names
-    return pl.DataFrame([{name: record.get(name) for name in names} for record in records], schema=empty.schema)
+    alone = [{"unit_id": record.get("imu_id"), "is_primary": True, **record} for record in records]
+    return pl.DataFrame([{name: record.get(name) for name in names} for record in alone], schema=empty.schema)
 
 
 def lead(vehicle_id: str, flight_id: str, day: int | None = 0) -> dict[str, Any]:

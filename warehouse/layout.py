@@ -13,7 +13,7 @@ import re
 import string
 from pathlib import Path
 
-from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES
+from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES, signal_kind
 from fieldcal.warehouse.errors import disk
 
 _PLAIN = frozenset(f"{string.ascii_letters}{string.digits}._-".encode())
@@ -65,7 +65,7 @@ def decode_id(name: str) -> str | None:
 
 def signal_path(root: Path, table: str, vehicle_id: str, flight_id: str) -> Path:
     """File of one flight's readings."""
-    _known(table, SIGNAL_TABLES)
+    _known(signal_kind(table), SIGNAL_TABLES)
     return root / "signals" / table / f"{_PARTITION}{encode_id(vehicle_id)}" / f"{encode_id(flight_id)}.parquet"
 
 
@@ -88,7 +88,7 @@ def history_files(root: Path, table: str) -> list[Path]:
 
 def signal_files(root: Path, table: str) -> list[Path]:
     """Files of a signal table, one a flight, in a fixed order."""
-    _known(table, SIGNAL_TABLES)
+    _known(signal_kind(table), SIGNAL_TABLES)
     return sorted((root / "signals" / table).glob(f"{_PARTITION}*/*.parquet"))
 
 

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Unpack
 
 import polars as pl
 
-from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES
+from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES, signal_kind
+from fieldcal.schemas.columns import IS_PRIMARY, UNIT_ID
+from fieldcal.schemas.rows import UNIT_OF_OLDER_ROWS
 from fieldcal.warehouse.layout import encode_id, history_files, history_path, signal_files, signal_path
 from fieldcal.warehouse.signals import signal_ids
 from fieldcal.warehouse.store import by_absent_columns, empty_frame
@@ -36,14 +38,14 @@ class Warehouse:
         """A table as a lazy frame; typed and empty when there is nothing yet.
 
         Signals come with `vehicle_id` and `flight_id` in front; name a flight unless all of them are meant.
-        `vehicle_id` and `flight_id` narrow what is read.
+        `vehicle_id` and `flight_id` narrow what is read. Of further units on board: "imu.1", "magnetometer.1", ….
 
         Raises
         ------
         ValueError
             There is no such table.
         """
-        if table in SIGNAL_TABLES:
+        if signal_kind(table) in SIGNAL_TABLES:
             return self._signals(table, vehicle_id, flight_id)
         if table not in HISTORY_TABLES:
             raise ValueError(
@@ -77,14 +79,18 @@ class Warehouse:
             files = [path for path in files if path.parent.name == f"vehicle_id={encode_id(vehicle_id)}"]
         if flight_id is not None:
             files = [path for path in files if path.stem == encode_id(flight_id)]
-        return pl.concat([_with_ids(path, table) for path in files] or [_ids(empty_frame(table).lazy(), "", "")])
+        kind = signal_kind(table)
+        return pl.concat([_with_ids(path, kind) for path in files] or [_ids(empty_frame(kind).lazy(), "", "")])
 
 
 def _scan(files: Sequence[Path], table: str) -> pl.LazyFrame:
-    """Rows of a table's files; null in a column that is younger than the file."""
+    """Rows of a table's files, also where columns are younger than a file (`schemas.check`)."""
     columns, forms = TABLES[table].column_names, by_absent_columns(files, table)
+    younger = {UNIT_ID.name: pl.col(UNIT_OF_OLDER_ROWS), IS_PRIMARY.name: pl.lit(True)}
     parts = [
-        pl.scan_parquet(paths, hive_partitioning=False, glob=False).select(n for n in columns if n not in absent)
+        pl.scan_parquet(paths, hive_partitioning=False, glob=False)
+        .with_columns(**{name: value for name, value in younger.items() if name in absent})
+        .select(n for n in columns if n not in absent or n in younger)
         for absent, paths in forms.items()
     ]
     return parts[0] if list(forms) == [()] else pl.concat([empty_frame(table).lazy(), *parts], how="diagonal")

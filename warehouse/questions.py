@@ -15,6 +15,7 @@ COLUMNS = (
     "started_at",
     "vehicle_id",
     "imu_id",
+    "unit_id",
     "session_id",
     "flight_id",
     "sensor",
@@ -40,8 +41,22 @@ def calibration_history(
             rows = rows.filter(pl.col(column) == wanted)
     if since is not None:
         rows = rows.filter(pl.col("started_at") >= moment_of("--since", since))
-    order = ["started_at", "vehicle_id", "flight_id", "sensor", "method", "parameter", "axis"]
+    order = ["started_at", "vehicle_id", "flight_id", "unit_id", "sensor", "method", "parameter", "axis"]
     return rows.select(COLUMNS).sort(order, nulls_last=True).collect()
+
+
+def units_flown(warehouse: Warehouse, vehicle_id: str | None = None) -> pl.DataFrame:
+    """vehicle_id, imu_id, unit_id, sensor: what each vehicle flew with last, calibrated or refused: the primary unit of
+    each sensor, on the IMU of its latest flight."""
+    last = (
+        warehouse.scan("calibration", vehicle_id=vehicle_id)
+        .filter("is_primary")
+        .sort("started_at", "flight_id", nulls_last=False)
+        .with_columns(now=pl.col("imu_id").last().over("vehicle_id"))
+        .filter(pl.col("imu_id") == pl.col("now"))
+    )
+    ids = pl.col("imu_id", "unit_id").last()
+    return last.group_by("vehicle_id", "sensor").agg(ids).sort("vehicle_id", "sensor").collect()
 
 
 def existing(root: Path) -> Warehouse:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import polars as pl
 
+from fieldcal.schemas import signal_kind
 from fieldcal.warehouse import checksums
 from fieldcal.warehouse.layout import decode_id, prepare, signal_path, vehicle_of
 from fieldcal.warehouse.store import TableWriter, read_facts, read_table
@@ -22,16 +23,18 @@ def signal_writer(
     units: Mapping[str, str] | None = None,
     metadata: Mapping[str, str] | None = None,
 ) -> TableWriter:
-    """Writer of one signal of one flight; its sha256 is recorded, the exact ids are in the file's metadata."""
+    """Writer of one signal of a flight ("imu", of a further unit "imu.1"); its sha256 is recorded, the exact ids are in
+    the file's metadata."""
     prepare(root)
     path = signal_path(root, table, vehicle_id, flight_id)
     facts = {**(metadata or {}), "fieldcal.vehicle_id": vehicle_id, "fieldcal.flight_id": flight_id}
-    return TableWriter(table, path, units=units, metadata=facts, around_rename=partial(checksums.recording, root, path))
+    kind = signal_kind(table)
+    return TableWriter(kind, path, units=units, metadata=facts, around_rename=partial(checksums.recording, root, path))
 
 
 def read_signal(root: Path, table: str, vehicle_id: str, flight_id: str) -> pl.DataFrame:
     """Readings of one flight."""
-    return read_table(signal_path(root, table, vehicle_id, flight_id), table)
+    return read_table(signal_path(root, table, vehicle_id, flight_id), signal_kind(table))
 
 
 def signal_ids(path: Path) -> tuple[str, str]:

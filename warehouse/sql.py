@@ -20,6 +20,8 @@ import pyarrow as pa
 from fieldcal import schemas
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import HISTORY_TABLES
+from fieldcal.schemas.columns import IS_PRIMARY, UNIT_ID
+from fieldcal.schemas.rows import UNIT_OF_OLDER_ROWS
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.layout import history_files, vehicle_of
 from fieldcal.warehouse.store import by_absent_columns, frame
@@ -126,7 +128,7 @@ def _answer(
 
 
 def _table_view(table: str, paths: Sequence[Path]) -> str:
-    """A view over a table's files; null in a column that is younger than the file."""
+    """A view over a table's files; also where columns are younger than a file."""
     forms = by_absent_columns(paths, table)
     return f"CREATE VIEW {table} AS {' UNION ALL '.join(_select(table, own, absent) for absent, own in forms.items())}"
 
@@ -141,11 +143,16 @@ def _select(table: str, paths: Sequence[Path], absent: Collection[str]) -> str:
         "hive_partitioning = true, hive_types = {'vehicle_id': 'VARCHAR'}" if by_folder else "hive_partitioning = false"
     )
     names = schemas.TABLES[table].column_names
-    columns = ", ".join(_null(table, name) if name in absent else f'f."{name}"' for name in names)
+    columns = ", ".join(_younger(table, name) if name in absent else f'f."{name}"' for name in names)
     return f"SELECT {columns} FROM read_parquet({_listed(paths)}, {how}) AS f"
 
 
-def _null(table: str, name: str) -> str:
+def _younger(table: str, name: str) -> str:
+    """What rows of an older version have in a column that they lack (`schemas.check`)."""
+    if name == UNIT_ID.name:
+        return f'f."{UNIT_OF_OLDER_ROWS}" AS "{name}"'
+    if name == IS_PRIMARY.name:
+        return f'TRUE AS "{name}"'
     column = schemas.arrow_schema(table).field(name)
     (kind,) = duckdb.from_arrow(pa.schema([column]).empty_table()).types
     return f'CAST(NULL AS {kind}) AS "{name}"'

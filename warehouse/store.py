@@ -22,6 +22,8 @@ from fieldcal import schemas
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import SchemaMismatch
 from fieldcal.schemas.arrow import VERSION_KEY
+from fieldcal.schemas.columns import IS_PRIMARY, UNIT_ID
+from fieldcal.schemas.rows import UNIT_OF_OLDER_ROWS
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import AroundRename, AtomicFile
 
@@ -243,10 +245,17 @@ def _arrow(data: Data) -> pa.Table:
 
 
 def _with_nulls(rows: pa.Table, absent: Collection[str], table: str, stage: bool) -> pa.Table:
-    """The rows with the columns that they lack, in the table's order."""
+    """The rows with the columns that they lack (`schemas.check`), in the table's order."""
     schema = schemas.arrow_schema(table, stage=stage)
     for name in absent:
-        rows = rows.append_column(schema.field(name), pa.nulls(rows.num_rows, schema.field(name).type))
+        kind = schema.field(name).type
+        if name == UNIT_ID.name:
+            values = rows[UNIT_OF_OLDER_ROWS]
+        elif name == IS_PRIMARY.name:
+            values = pa.repeat(pa.scalar(True, kind), rows.num_rows)
+        else:
+            values = pa.nulls(rows.num_rows, kind)
+        rows = rows.append_column(schema.field(name), values)
     return rows.select(schema.names)
 
 

@@ -19,6 +19,7 @@ from fieldcal.exports.calibration import Constants
 from fieldcal.flight.calibrate import CalibratedLog, LogRead, identify, overruled, read, run_stages
 from fieldcal.flight.rows import rows_frame
 from fieldcal.geometry import sensor_model
+from fieldcal.logs.on_board import PRIMARY
 from fieldcal.names import SENSORS, Approach, Json, exactness
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.rows import FlightDocument, Refusable, SyncRow
@@ -188,7 +189,8 @@ class Calibration:
             )
         started = flight["started_at"]
         as_of = "" if started is None else started.isoformat()
-        return Constants(flight["vehicle_id"], flight["imu_id"], triads, as_of)
+        ids = {row["sensor"]: row["unit_id"] for row in self.document["calibration"] if row["sensor"] in triads}
+        return Constants(flight["vehicle_id"], flight["imu_id"], triads, as_of, ids)
 
     def report(self, path: Path | str) -> Path:
         """Write the flight's report, one HTML file that needs no network."""
@@ -300,6 +302,7 @@ def calibrate(
     parameters: Mapping[str, float | bool | str] | None = None,
     config: Path | str | None = None,
     vehicle: str | None = None,
+    unit: str = PRIMARY,
 ) -> Calibration:
     """Calibrate the inertial sensors of one flight. Nothing is stored.
 
@@ -319,6 +322,10 @@ def calibrate(
         Stage parameters to overrule, by the names of fieldcal.toml.
     config, vehicle : optional
         As in `read_log`; with a recording they are its own.
+    unit : str
+        Which of several units on board, by the signal its readings are in: "imu" is the primary IMU and magnetometer,
+        "imu.1" a further IMU (with the primary magnetometer), "magnetometer.1" a further magnetometer (with the primary
+        IMU).
 
     Returns
     -------
@@ -329,7 +336,7 @@ def calibrate(
     ConfigurationError
         A wrong configuration, or an unknown parameter: the nearest known one is named.
     FieldcalError
-        `not_found`, `not_readable`: there is no such log.
+        `not_found`, `not_readable`: there is no such log. `wrong_option`: there is no such unit in it.
     ValueError
         Unknown method; `config` or `vehicle` beside a recording.
 
@@ -360,13 +367,13 @@ def calibrate(
     if isinstance(log, Recording):
         own = as_recording(log, config, vehicle).source
         wanted = overruled(own.vehicle, profile=profile, method=method, changes=changes)
-        return _calibration(replace(own, vehicle=wanted))
+        return _calibration(replace(own, vehicle=wanted), unit)
     job, configured = identify(Path(log), None if config is None else Path(config), vehicle_id=vehicle)
-    return _calibration(read(job, overruled(configured, profile=profile, method=method, changes=changes)))
+    return _calibration(read(job, overruled(configured, profile=profile, method=method, changes=changes)), unit)
 
 
-def _calibration(log: LogRead) -> Calibration:
-    result = run_stages(log)
+def _calibration(log: LogRead, unit: str) -> Calibration:
+    result = run_stages(log, unit)
     document = result.document
     runs = tuple(
         StageRun(

@@ -101,9 +101,11 @@ class Warehouse(query.Warehouse):
 
         return drift_rows(self.root, vehicle, sensor, parameter)
 
-    def calibration_at(self, vehicle: str, temperature_degc: float | None = None) -> Constants:
-        """What a vehicle flies with at a temperature, °C, 25 unless given: the IMU that flew last on it, by its trend
-        over temperature and time where one is known.
+    def calibration_at(
+        self, vehicle: str, temperature_degc: float | None = None, *, unit: str | None = None
+    ) -> Constants:
+        """What a vehicle flies with at a temperature, °C, 25 unless given: the primary units that flew last on it, by
+        their trend over temperature and time where one is known. `unit`: another one on board, by its `unit_id`.
 
         Raises
         ------
@@ -112,4 +114,4 @@ class Warehouse(query.Warehouse):
         """
         from fieldcal.exports.calibration_at import constants_of
 
-        return constants_of(self.root, vehicle, temperature_degc)
+        return constants_of(self.root, vehicle, temperature_degc, unit)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from fieldcal.batch.documents import Answer, PlainOutcome
 from fieldcal.batch.outcome import Outcome, failed_outcome
 from fieldcal.batch.sources import know_sources
-from fieldcal.batch.steps import STEPS, FlightWork
+from fieldcal.batch.steps import FlightWork
 from fieldcal.config.configuration import Configuration
 from fieldcal.config.find import Source, configuration_of
 from fieldcal.errors import unforeseen
 from fieldcal.flight.job import Job, PlainJob
+from fieldcal.flight.record import Record
 from fieldcal.flight.threads import one_thread
 from fieldcal.provenance.run_key import code_digest
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.stages.pipeline import INGEST
 from fieldcal.warehouse.errors import WarehouseError
 
 OTHER_CODE: list[str] = [
@@ -36,20 +38,28 @@ def one_flight(root: Path, job: Job, settings: Configuration, do: Step = FlightW
     WarehouseError
         What concerns every flight: the warehouse cannot be written.
     """
-    work = FlightWork(root, job, settings.vehicle(job.vehicle_id))
-    ran: list[str] = []
-    cached: list[str] = []
-    for step in STEPS:
-        if step not in work.steps():
-            break
+    records: dict[str, Record] = {}
+    why: dict[str, str] = {}
+    work_s = 0.0
+    for work, step in _steps(FlightWork(root, job, settings.vehicle(job.vehicle_id))):
+        before_s = work.work_s
         try:
             do(work, step)
         except WarehouseError:
             raise
         except Exception as error:
-            return failed_outcome(job, work.records, step, unforeseen(job.log_uri, error))
-        (ran if step in work.why else cached).append(step)
-    return Outcome(job, work.records, tuple(ran), tuple(cached), work.why, work.work_s)
+            return failed_outcome(job, records | work.records, step, unforeseen(job.log_uri, error))
+        records, why, work_s = records | work.records, why | work.why, work_s + work.work_s - before_s
+    ran, cached = (tuple(step for step in records if (step in why) == new) for new in (True, False))
+    return Outcome(job, records, ran, cached, why, work_s)
+
+
+def _steps(work: FlightWork) -> Iterator[tuple[FlightWork, str]]:
+    """Every step of a flight with the work that it is of; the next is asked for when one is done."""
+    yield work, INGEST
+    yield from ((work, step) for step in work.steps())
+    for other in work.further():
+        yield from ((other, step) for step in other.steps())
 
 
 def flights(
@@ -83,4 +93,4 @@ def flights(
 
 def lost(job: PlainJob, reason: str) -> PlainOutcome:
     """Outcome, as plain JSON, of a flight that took its process down."""
-    return failed_outcome(Job(**job), {}, STEPS[0], reason).plain()
+    return failed_outcome(Job(**job), {}, INGEST, reason).plain()

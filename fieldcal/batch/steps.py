@@ -7,7 +7,7 @@ and the history need to know: status, reason, measured numbers, versions, and th
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import cast
@@ -23,16 +23,18 @@ from fieldcal.config.stage_settings import as_json, taken_from
 from fieldcal.errors import UnreadableLog, unforeseen
 from fieldcal.flight.job import Job, file_stamp
 from fieldcal.flight.record import Causes, Output, Record
+from fieldcal.flight.units import units_of
 from fieldcal.flight.versions import versions
 from fieldcal.logs import ingest
 from fieldcal.logs.facts import Facts
+from fieldcal.logs.on_board import PRIMARY, signals_of
 from fieldcal.logs.tidy import Disordered
 from fieldcal.names import Json, Status, Verdict
 from fieldcal.provenance.run_key import run_key
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.pipeline import INGEST, PIPELINE
 from fieldcal.stages.results import StageResult, plain
-from fieldcal.stages.stage import Stage, run_stage
+from fieldcal.stages.stage import Stage, run_stage, stage_and_unit, step_of
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.files import file_sha256
 from fieldcal.warehouse.layout import signal_path
@@ -41,11 +43,14 @@ from fieldcal.warehouse.stage_store import StageStore
 from fieldcal.warehouse.store import TableWriter
 
 STEPS = (INGEST, *(stage.name for stage in PIPELINE))
+"""Of the primary unit."""
 STAGES: dict[str, Stage] = {stage.name: stage for stage in PIPELINE}
 
 
 class FlightWork:
-    """The steps of one flight, in order. Tables stay in memory while they are needed, and are read from disk otherwise.
+    """The steps of one unit of a flight, in order: "ingest" and the stages of the primary unit, and of each of the
+    `further` ones its stages ("joint@imu.1"). Tables stay in memory while they are needed, else they are read from
+    disk.
 
     Parameters
     ----------
@@ -55,10 +60,13 @@ class FlightWork:
         The log.
     vehicle : Vehicle
         Its vehicle's configuration.
+    table : str
+        The unit, by the table of its readings.
     """
 
-    def __init__(self, root: Path, job: Job, vehicle: Vehicle) -> None:
+    def __init__(self, root: Path, job: Job, vehicle: Vehicle, table: str = PRIMARY) -> None:
         self.job = job
+        self.table = table
         self.records: dict[str, Record] = {}
         self.why: dict[str, str] = {}
         """Why each step had to run, of those that `find` did not."""
@@ -76,12 +84,22 @@ class FlightWork:
         return Verdict(self.records[INGEST]["facts"]["verdict"]).usable
 
     def steps(self) -> tuple[str, ...]:
-        """The steps there are: ingest alone for a log that is rejected or quarantined."""
-        return STEPS if INGEST not in self.records or self.usable() else STEPS[:1]
+        """The unit's steps after ingest, known once ingest's record is: none of a log that is rejected or
+        quarantined."""
+        return tuple(step_of(stage, self.table) for stage in STEPS[1:]) if self.usable() else ()
+
+    def further(self) -> Iterator[FlightWork]:
+        """The work on each further unit on board that is to be calibrated."""
+        facts = self.records[INGEST]["facts"]
+        for unit in units_of(facts, self._vehicle)[1:] if self.usable() else ():
+            other = FlightWork(self._root, self.job, self._vehicle, unit.table)
+            other._take(INGEST, self.records[INGEST])
+            yield other
 
     def key(self, step: str) -> str:
         """run_key of a step; the records of the steps before it must be known."""
-        return run_key(step, sources()[step], self._params(step), self._hashes(step))
+        stage, _ = stage_and_unit(step)
+        return run_key(stage, sources()[stage], self._params(step), self._hashes(step))
 
     def do(self, step: str) -> None:
         """Take a step's result from the cache, or run it."""
@@ -110,34 +128,42 @@ class FlightWork:
             The warehouse cannot be written: this concerns every log.
         """
         began = time.perf_counter()
-        record = self._ingest() if step == INGEST else self._stage(STAGES[step])
+        record = self._ingest() if step == INGEST else self._stage(step)
         self.work_s += time.perf_counter() - began
         self._take(step, record)
         return record
 
     def pending(self) -> dict[str, str]:
         """Steps whose result is missing, and those that read from them, each with why; nothing is run or changed."""
+        if INGEST not in self.records and self.find(INGEST) is None:
+            new_input = f"new input: {INGEST}"
+            return {INGEST: self.why[INGEST], **dict.fromkeys(STEPS[1:], new_input)}
         missing: dict[str, str] = {}
-        for step in STEPS:
-            if INGEST in self.records and not self.usable():
-                break
-            sources = {name.split(".")[0] for name in STAGES[step].reads.values()} if step != INGEST else set()
-            if above := sorted(sources & set(missing)):
+        for step in self.steps():
+            read = {name.split(".")[0] for name in _stage_of(step).reads.values()} - {INGEST}
+            if above := sorted({step_of(stage, self.table) for stage in read} & set(missing)):
                 missing[step] = f"new input: {', '.join(above)}"
             elif self.find(step) is None:
                 missing[step] = self.why[step]
+        if self.table == PRIMARY:
+            for other in self.further():
+                missing |= other.pending()
+                self.records |= other.records
         return missing
 
     def _take(self, step: str, record: Record) -> None:
         self.records[step] = record
-        outputs = record["signals"] if step == INGEST else record["outputs"]
-        self._inputs |= {f"{step}.{table}": output["sha256"] for table, output in outputs.items()}
-        if step == INGEST:
-            self._settings = ingest.settings_of(record["facts"], self._vehicle) if self.usable() else None
+        stage, _ = stage_and_unit(step)
+        if step != INGEST:
+            self._inputs |= {f"{stage}.{table}": output["sha256"] for table, output in record["outputs"].items()}
+        else:
+            seen = signals_of(self.table, record["signals"])
+            self._inputs |= {f"{INGEST}.{name}": record["signals"][table]["sha256"] for name, table in seen.items()}
+            self._settings = ingest.settings_of(record["facts"], self._vehicle, self.table) if self.usable() else None
 
     def _params(self, step: str) -> Mapping[str, Json]:
         if step != INGEST:
-            return as_json(taken_from(self._known(), STAGES[step].takes))
+            return as_json(taken_from(self._known(), _stage_of(step).takes))
         named = {"vehicle_id": self.job.vehicle_id, "name": Path(self.job.path).name}
         return {**reader_settings(self._vehicle), **named}
 
@@ -149,7 +175,7 @@ class FlightWork:
     def _hashes(self, step: str) -> dict[str, str]:
         if step == INGEST:
             return {"log": self.job.sha256 or ""}
-        sources = sorted(set(STAGES[step].reads.values()))
+        sources = sorted(set(_stage_of(step).reads.values()))
         return {name: self._inputs[name] for name in sources if name in self._inputs}
 
     def _causes(self, step: str) -> Causes:
@@ -158,7 +184,7 @@ class FlightWork:
             "run_key": self.key(step),
             "params": plain(self._params(step)),
             "inputs": self._hashes(step),
-            "source": sources()[step],
+            "source": sources()[stage_and_unit(step)[0]],
             "versions": versions(),
         }
 
@@ -222,8 +248,8 @@ class FlightWork:
 
     # --- stages
 
-    def _stage(self, stage: Stage) -> Record:
-        key = self.key(stage.name)
+    def _stage(self, step: str) -> Record:
+        stage, key = _stage_of(step), self.key(step)
         try:
             tables = {name: self._table(name) for name in set(stage.reads.values()) if name in self._inputs}
             result = run_stage(stage, tables, self._known())
@@ -232,18 +258,20 @@ class FlightWork:
         except Exception as error:
             why = f"{stage.name}: {unforeseen(self.job.log_uri, error)}"
             result = StageResult(status=Status.FAILED, reason_code=ReasonCode.STAGE_FAILED, reason=why)
-        causes = self._causes(stage.name)
+        causes = self._causes(step)
         record = _record(result.status, result.reason_code, result.reason, result.measured, causes)
         if result.status == Status.FAILED:
             return _unkept(record, key)
         self._tables |= {f"{stage.name}.{name}": frame for name, frame in result.tables.items()}
-        return self._kept(stage.name, key, result.tables, record)
+        return self._kept(step, key, result.tables, record)
 
     def _table(self, name: str) -> pl.DataFrame:
         if name not in self._tables:
-            step, table = name.split(".")
-            if step == INGEST:
-                self._tables[name] = read_signal(self._root, table, self.job.vehicle_id, self.job.flight_id)
+            stage, table = name.split(".")
+            step = step_of(stage, self.table)
+            if stage == INGEST:
+                own = signals_of(self.table, self.records[INGEST]["signals"])[table]
+                self._tables[name] = read_signal(self._root, own, self.job.vehicle_id, self.job.flight_id)
             else:
                 loaded = self._store.load(step, self.job.flight_id, str(self.records[step]["run_key"]), [table])
                 self._tables[name] = loaded[table]
@@ -251,6 +279,10 @@ class FlightWork:
 
     def _kept(self, step: str, key: str, tables: Mapping[str, pl.DataFrame], record: Record) -> Record:
         return _of_store(self._store.save(step, self.job.flight_id, key, tables, record))
+
+
+def _stage_of(step: str) -> Stage:
+    return STAGES[stage_and_unit(step)[0]]
 
 
 class _Quarantined(Exception):

@@ -9,7 +9,7 @@ from fieldcal.cli.options import AsCsv, AsJson, Root, UnusedConfig
 
 SHOWN = (
     "vehicle_id",
-    "imu_id",
+    "unit_id",
     "sensor",
     "method",
     "parameter",
@@ -45,7 +45,7 @@ def drift(
     Parameters
     ----------
     vehicle
-        Only IMUs that this vehicle carries.
+        Only units that this vehicle carries.
     sensor
         Only this sensor; vps: lag and skew of its clock, fit: Theil coefficients.
     parameter

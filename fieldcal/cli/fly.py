@@ -21,6 +21,7 @@ def export(
     *,
     to: Annotated[Format, Parameter(name=["--format", "-f"])] = "json",
     at_temperature: float | None = None,
+    unit: str | None = None,
     output: Output = None,
     warehouse: Root = None,
     config: UnusedConfig = None,
@@ -30,18 +31,20 @@ def export(
     Parameters
     ----------
     vehicle
-        The vehicle that flies; the constants are those of the IMU that flew last on it.
+        The vehicle that flies; the constants are those of the primary units that flew last on it.
     to
         PX4 or ArduPilot parameters, ROS 2 or Kalibr YAML, JSON, a C header.
     at_temperature
         °C; 25 unless given. Slopes on temperature go along where the target has a place for them.
+    unit
+        Another unit on board, by its unit_id (fieldcal history --json tells them).
     output
         File to write; else stdout.
     """
     from fieldcal.warehouse.files import write_bytes
     from fieldcal.words.talk import say
 
-    result = fieldcal.export(fieldcal.Warehouse(warehouse).calibration_at(vehicle, at_temperature), to)
+    result = fieldcal.export(fieldcal.Warehouse(warehouse).calibration_at(vehicle, at_temperature, unit=unit), to)
     for warning in result.warnings:
         say(warning)
     if output is None:

@@ -66,6 +66,7 @@ def calibrate(
     vehicle: str | None = None,
     method: Literal["auto", "serial", "joint"] | None = None,
     profile: Literal["full", "onboard", "paper"] | None = None,
+    unit: str = "imu",
     set_: Annotated[list[str] | None, Parameter(name="--set")] = None,
     report: Annotated[Path | None, Parameter(help="Write the flight's report to this HTML file too.")] = None,
     as_json: AsJson = False,
@@ -84,6 +85,8 @@ def calibrate(
         "serial", one step after the other, or "joint", all in one likelihood; else what fieldcal.toml says.
     profile
         Presets of the stages.
+    unit
+        Of a log with several: "imu" the primary ones, "imu.1", "magnetometer.1", … a further one.
     set_
         Overrule a stage parameter: --set smoothing_cutoff_hz=6.
     """
@@ -91,7 +94,9 @@ def calibrate(
     from fieldcal.words.talk import say
 
     changes = _assignments(set_ or [])
-    result = fieldcal.calibrate(log, method=method, profile=profile, parameters=changes, config=config, vehicle=vehicle)
+    result = fieldcal.calibrate(
+        log, method=method, profile=profile, parameters=changes, config=config, vehicle=vehicle, unit=unit
+    )
     if report is not None:
         say(f"Report: {result.report(report)}")
     if as_json:
@@ -181,7 +186,9 @@ def history(
 
     rows = fieldcal.Warehouse(warehouse).history(vehicle=vehicle, sensor=sensor, parameter=parameter, since=since)
     whole = as_json or as_csv
-    print_frame(rows if whole else rows.drop("imu_id", "session_id", "flight_id"), as_json=as_json, as_csv=as_csv)
+    one = rows["unit_id"].equals(rows["imu_id"])
+    hidden = ["imu_id", "session_id", "flight_id", *(["unit_id"] if one else [])]
+    print_frame(rows if whole else rows.drop(hidden), as_json=as_json, as_csv=as_csv)
     return OK
 
 

@@ -89,7 +89,7 @@ def _worst(root: Path, flights: Sequence[str]) -> list[list[str]]:
     places = warehouse.scan("flight").select("flight_id", "log_uri")
     rows = (
         warehouse.scan("fit")
-        .filter(pl.col("flight_id").is_in(list(flights)) & (pl.col("signal") == "smoothed"))
+        .filter(pl.col("flight_id").is_in(list(flights)) & (pl.col("signal") == "smoothed") & pl.col("is_primary"))
         .join(places, on="flight_id")
         .sort("tic", "log_uri", "quantity", "method", descending=[True, False, False, False], nulls_last=True)
         .select("log_uri", "quantity", "method", "reference", "tic", "rms", "rms_unit")

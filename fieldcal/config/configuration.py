@@ -141,7 +141,12 @@ class McapMap(Table):
     imu_fields: Annotated[ImuFields | None, _meaning("fields of the IMU's message: one vector, or three numbers")] = (
         None
     )
-    frame_id: Annotated[Text | None, _meaning("which of several IMUs on one topic: its messages' frame_id")] = None
+    frame_id: Annotated[
+        Text | None, _meaning("the primary one of several IMUs on one topic: its messages' frame_id")
+    ] = None
+    further: Annotated[
+        list[Text], _meaning("topics of further IMUs and magnetometers on board, calibrated beside the primary ones")
+    ] = []
     time: Annotated[Literal["header", "log"], _meaning("the stamp used: the message's own, or the recorder's")] = (
         "header"
     )
@@ -166,6 +171,9 @@ class VehicleTable(Table):
     units: Annotated[Units, _meaning("units of the logged readings")] = {}
     nominal_scale: Annotated[PerSensor[PositiveTriple], _meaning("scale of the data sheet, one or three numbers")] = {}
     reference_reading: Annotated[PerSensor[Triple], _meaning("reading at which zero_bias is told")] = {}
+    units_on_board: Annotated[
+        Literal["all", "primary"], _meaning("which IMUs and magnetometers of a log with several are calibrated")
+    ] = "all"
     simulated: Annotated[
         bool, _meaning("the vehicle is a simulation; else logs of simulated sensors are set aside")
     ] = False
@@ -181,8 +189,9 @@ class Vehicle(VehicleTable):
     imu_id: str
 
     def settings(self) -> dict[str, Json]:
-        """Plain JSON of everything that can change results; names of vehicle and IMU do not, nor does the profile's."""
-        return self.model_dump(mode="json", exclude={"vehicle_id", "imu_id", "profile"})
+        """Plain JSON of everything that can change results; names of vehicle and IMU do not, nor does the profile's,
+        nor what else on board is calibrated."""
+        return self.model_dump(mode="json", exclude={"vehicle_id", "imu_id", "profile", "units_on_board"})
 
 
 def _inside(glob: str) -> str:

@@ -38,6 +38,7 @@ class FlightSettings:
     reference_reading : d0 of `zero_bias`, None leaves it to the readings
     applied_matrix, applied_offset : what an autopilot had made of raw readings before it logged them (`logs.applied`),
         whether that is known whole, and how far it changed within the flight; None where they are raw
+    own_sensors : those of the unit that is calibrated; the others only help
     """
 
     parameters: Parameters
@@ -60,6 +61,7 @@ class FlightSettings:
     applied_known: Mapping[Sensor, bool | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
     applied_matrix_sd: Mapping[Sensor, float | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
     applied_offset_sd: Mapping[Sensor, Triple | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
+    own_sensors: tuple[Sensor, ...] = SENSORS
 
     def changed(self, **changes: object) -> FlightSettings:
         """These settings with others for some, parameters of the stages among them.

@@ -317,6 +317,7 @@ class CompositionSettings(StageSettings):
     applied_known: Mapping[Sensor, bool | None]
     applied_matrix_sd: Mapping[Sensor, float | None]
     applied_offset_sd: Mapping[Sensor, Triple | None]
+    own_sensors: tuple[Sensor, ...]
 
 
 # --- from a flight's settings, and to and from the plain JSON of a record

@@ -95,6 +95,8 @@ class Constants:
         Sensor → its constants; a sensor without any is left out.
     as_of : str
         ISO 8601 of the latest flight that they come from; empty when its clock is unknown.
+    unit_ids : mapping of str to str
+        Sensor → the unit that its constants belong to; empty where that is not told.
 
     Examples
     --------
@@ -106,6 +108,7 @@ class Constants:
     imu_id: str
     triads: Mapping[str, Triad]
     as_of: str
+    unit_ids: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def heading(self) -> str:

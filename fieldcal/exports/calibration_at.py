@@ -15,13 +15,13 @@ from fieldcal.names import INERTIAL_FIRST
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.stages.tables import AXES
-from fieldcal.warehouse.questions import existing
+from fieldcal.warehouse.questions import existing, units_flown
 from fieldcal.words.rows import typed
 
 _QUESTION = """
 SELECT a.*, l.slope_per_degc, l.curve_per_degc2, l.curve_per_degc3, l.temperature_min_degc, l.temperature_max_degc
 FROM calibration_at(?) AS a
-JOIN latest_calibration AS l USING (imu_id, sensor, parameter, axis)
+JOIN latest_calibration AS l USING (unit_id, sensor, parameter, axis)
 WHERE a.vehicle_id = ? AND a.parameter IN ('scale', 'zero')
 """
 
@@ -30,6 +30,7 @@ class _Axis(TypedDict):
     """A row of the answer: one parameter and axis."""
 
     imu_id: str
+    unit_id: str
     parameter: str
     axis: str
     value: float
@@ -49,8 +50,10 @@ _Number = Literal["value", "sd", "slope_per_degc", "curve_per_degc2", "curve_per
 _CURVE: tuple[_Number, ...] = ("slope_per_degc", "curve_per_degc2", "curve_per_degc3")
 
 
-def constants_of(root: Path, vehicle_id: str, temperature_degc: float | None = None) -> Constants:
-    """Constants at a temperature (default 25 °C) of the IMU that flew last on the vehicle.
+def constants_of(
+    root: Path, vehicle_id: str, temperature_degc: float | None = None, unit_id: str | None = None
+) -> Constants:
+    """Constants at a temperature (default 25 °C) of the primary units that flew last on the vehicle, or of one unit.
 
     Scale and zero are what is looked up: the two hardly depend on each other, and the offset follows from both.
 
@@ -62,14 +65,21 @@ def constants_of(root: Path, vehicle_id: str, temperature_degc: float | None = N
     at = REFERENCE_DEGC if temperature_degc is None else float(temperature_degc)
     warehouse = existing(root)
     rows = warehouse.sql(_QUESTION, [at, vehicle_id])
+    units = rows["unit_id"].unique().sort().to_list()
     if rows.is_empty():
         known = warehouse.scan("calibration").select("vehicle_id").unique().sort("vehicle_id").collect()["vehicle_id"]
         there = ", ".join(known.head(20).to_list()) or "none"
         raise FieldcalError(
             ReasonCode.NO_CALIBRATION, f"No calibration of vehicle {vehicle_id!r} is known; there is: {there}."
         )
+    if unit_id is None:
+        rows = rows.join(units_flown(warehouse, vehicle_id), on=["sensor", "unit_id"], how="semi")
+    else:
+        rows = rows.filter(pl.col("unit_id") == unit_id)
+    if rows.is_empty():
+        told = "" if unit_id is None else f" of unit {unit_id!r}; there is: {', '.join(units)}"
+        raise FieldcalError(ReasonCode.NO_CALIBRATION, f"No calibration of vehicle {vehicle_id!r} is known{told}.")
     last = rows.sort("started_at", "flight_id", nulls_last=False).row(-1, named=True)
-    rows = rows.filter(pl.col("imu_id") == last["imu_id"])
     triads: dict[str, Triad] = {
         s: triad for s in INERTIAL_FIRST if (triad := _triad(rows.filter(sensor=s), at)) is not None
     }
@@ -79,7 +89,8 @@ def constants_of(root: Path, vehicle_id: str, temperature_degc: float | None = N
             f'No sensor of {vehicle_id!r} has all its axes calibrated; `fieldcal sql "FROM refusals"` says why.',
         )
     as_of = "" if last["started_at"] is None else last["started_at"].isoformat()
-    return Constants(vehicle_id, str(last["imu_id"]), triads, as_of)
+    ids = {s: str(rows.filter(sensor=s)["unit_id"][0]) for s in triads}
+    return Constants(vehicle_id, str(last["imu_id"]), triads, as_of, ids)
 
 
 def _triad(rows: pl.DataFrame, at: float) -> Triad | None:

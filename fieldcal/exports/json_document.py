@@ -22,6 +22,7 @@ def json_document(constants: Constants) -> Export:
         "model": MODEL,
         "vehicle_id": constants.vehicle_id,
         "imu_id": constants.imu_id,
+        "unit_ids": dict(constants.unit_ids),
         "as_of": constants.as_of or None,
         "sensors": {s: _triad(constants.triads[s]) for s in INERTIAL_FIRST if s in constants.triads},
     }

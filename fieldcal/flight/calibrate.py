@@ -15,9 +15,11 @@ from fieldcal.flight.job import Job
 from fieldcal.flight.record import StepRecord
 from fieldcal.flight.rows import flight_row, judged, lead, published_tables, rows_frame, run_rows
 from fieldcal.flight.threads import one_thread
+from fieldcal.flight.units import Unit, units_of
 from fieldcal.flight.versions import versions
 from fieldcal.logs import flight_id, ingest, log_format, log_sha256
 from fieldcal.logs.facts import Facts
+from fieldcal.logs.on_board import PRIMARY, signals_of
 from fieldcal.names import SENSORS, Approach, Json, Status, Verdict
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.rows import CalibrationRow, FitRow, FlightDocument, SyncRow, UnfoldedFlight, UnfoldedRun
@@ -96,14 +98,22 @@ def read(job: Job, vehicle: Vehicle) -> LogRead:
     return LogRead(job, vehicle, *ingest.read_flight(Path(job.path), reading))
 
 
-def run_stages(log: LogRead) -> CalibratedLog:
-    """Every stage on a log that was read."""
+def run_stages(log: LogRead, table: str = PRIMARY) -> CalibratedLog:
+    """Every stage on a log that was read, for the unit whose readings are in `table`.
+
+    Raises
+    ------
+    FieldcalError
+        `wrong_option`: there is no such unit on board.
+    """
     job, vehicle, facts = log.job, log.vehicle, log.facts
+    unit = _unit_of(log, table)
     records: dict[str, StepRecord] = {INGEST: _record(_ingest_result(facts))}
     settings: FlightSettings | None = None
-    tables: dict[str, pl.DataFrame] = {f"{INGEST}.{name}": frame for name, frame in log.signals.items()}
+    seen = signals_of(table, log.signals)
+    tables: dict[str, pl.DataFrame] = {f"{INGEST}.{name}": log.signals[place] for name, place in seen.items()}
     if Verdict(facts["verdict"]).usable:
-        settings = ingest.settings_of(facts, vehicle)
+        settings = ingest.settings_of(facts, vehicle, table)
         for stage in PIPELINE:
             try:
                 with one_thread():
@@ -115,10 +125,10 @@ def run_stages(log: LogRead) -> CalibratedLog:
             tables |= {f"{stage.name}.{name}": frame for name, frame in result.tables.items()}
     facts = judged(facts, records)
     leading = lead(job, vehicle.imu_id, facts)
-    published = published_tables([(leading, {name: (frame, None) for name, frame in tables.items()})])
+    published = published_tables([(leading, unit, {name: (frame, None) for name, frame in tables.items()})])
     sync = typed(rows_of(published["sync"]), SyncRow)
     flight = rows_frame("flight", [flight_row(job, leading, facts)])
-    runs = rows_frame("run", run_rows(leading, records))
+    runs = rows_frame("run", run_rows(leading, [unit], {unit.step(stage): one for stage, one in records.items()}))
     document: FlightDocument = {
         "flight": typed(map(unfolded, rows_of(flight)), UnfoldedFlight)[0],
         "calibration": typed(rows_of(published["calibration"]), CalibrationRow),
@@ -127,6 +137,15 @@ def run_stages(log: LogRead) -> CalibratedLog:
         "run": typed(map(unfolded, rows_of(runs)), UnfoldedRun),
     }
     return CalibratedLog(document, tables, settings)
+
+
+def _unit_of(log: LogRead, table: str) -> Unit:
+    units = {unit.table: unit for unit in units_of(log.facts, log.vehicle)}
+    if table not in units:
+        raise FieldcalError(
+            ReasonCode.WRONG_OPTION, f"{log.job.log_uri} has no unit {table!r}; there is {', '.join(units)}."
+        )
+    return units[table]
 
 
 def _configuration(config: Path | None, archive: Path) -> Configuration:

@@ -11,11 +11,14 @@ import polars as pl
 from fieldcal import schemas
 from fieldcal.flight.job import Job
 from fieldcal.flight.record import Refusal, StepRecord
+from fieldcal.flight.units import Unit
 from fieldcal.logs import ingest
 from fieldcal.logs.facts import Facts, FindingFacts
-from fieldcal.names import Json, Status, Verdict
-from fieldcal.schemas.rows import FlightLead, FlightRow, RunRow
+from fieldcal.logs.on_board import PRIMARY
+from fieldcal.names import Json, Sensor, Status, Verdict
+from fieldcal.schemas.rows import FlightLead, FlightRow, RunRow, UnitLead
 from fieldcal.stages.pipeline import PUBLISHED
+from fieldcal.stages.stage import stage_and_unit
 from fieldcal.warehouse.store import empty_frame, frame
 
 LEAD_SCHEMA = pl.Schema(
@@ -25,6 +28,8 @@ LEAD_SCHEMA = pl.Schema(
         "imu_id": pl.String(),
         "session_id": pl.String(),
         "started_at": pl.Datetime("us", "UTC"),
+        "unit_id": pl.String(),
+        "is_primary": pl.Boolean(),
         "run_key": pl.String(),
     }
 )
@@ -65,25 +70,28 @@ def flight_row(job: Job, leading: FlightLead, facts: Facts) -> FlightRow:
     }
 
 
-def run_rows(leading: FlightLead, records: Mapping[str, StepRecord]) -> list[RunRow]:
+def run_rows(leading: FlightLead, units: Sequence[Unit], records: Mapping[str, StepRecord]) -> list[RunRow]:
     """Rows of `run`, one a step. The sentence of a refusal stands among the measured numbers, as `reason`."""
+    by_table = {unit.table: unit for unit in units}
+    placed = [(*stage_and_unit(step), record) for step, record in records.items()]
     return [
         {
-            **leading,
-            "stage": step,
+            **unit_lead(leading, by_table[table]),
+            "stage": stage,
             "status": record["status"],
             "reason_code": record["reason_code"],
             "measured": _json({**record["measured"], **({"reason": record["reason"]} if record["reason"] else {})}),
             "run_key": record["run_key"],
             "versions": _json(record["versions"]),
         }
-        for step, record in records.items()
+        for stage, table, record in placed
+        if table in by_table
     ]
 
 
 def judged(facts: Facts, records: Mapping[str, StepRecord]) -> Facts:
     """The facts with what the stages found: a stage that failed makes an `ok` log `partial`, faults are findings."""
-    faults = [fault for record in records.values() for fault in _faults(record["measured"])]
+    faults = [fault for step, record in records.items() for fault in _faults(step, record["measured"])]
     facts = {**facts, "findings": [*facts["findings"], *faults]}
     failed = [record for record in records.values() if record["status"] == Status.FAILED]
     if facts["verdict"] == Verdict.OK and failed:
@@ -105,14 +113,16 @@ def refusals(records: Mapping[str, StepRecord]) -> list[Refusal]:
     ]
 
 
-def published_tables(flights: Sequence[tuple[FlightLead, StageTables]]) -> dict[str, pl.DataFrame]:
-    """`calibration`, `fit` and `sync` of flights, each its `lead` and its stages' tables."""
+def published_tables(units: Sequence[tuple[FlightLead, Unit, StageTables]]) -> dict[str, pl.DataFrame]:
+    """`calibration`, `fit` and `sync` of units of flights, each its flight's `lead` and its stages' tables."""
     result = {}
     for table, sources in PUBLISHED.items():
         parts = [
-            ({**leading, "run_key": run_key}, frame)
-            for leading, tables in flights
+            ({**unit_lead(leading, unit), "unit_id": unit_id, "run_key": run_key}, own)
+            for leading, unit, tables in units
+            if publishes(table, unit)
             for frame, run_key in (tables[name] for name in sources if name in tables)
+            for unit_id, own in _by_unit_id(table, unit, frame)
         ]
         if not parts:
             result[table] = empty_frame(table)
@@ -125,17 +135,38 @@ def published_tables(flights: Sequence[tuple[FlightLead, StageTables]]) -> dict[
     return result
 
 
+def publishes(table: str, unit: Unit) -> bool:
+    """Whether a unit has rows in a table: how attitudes agree, and what the VPS's clock is against the IMU's, tells of
+    IMUs; a further magnetometer has constants only."""
+    return table == "calibration" or Sensor.GYROSCOPE in unit.ids
+
+
+def _by_unit_id(table: str, unit: Unit, frame: pl.DataFrame) -> list[tuple[str, pl.DataFrame]]:
+    """(unit_id, rows) of what a stage found of a unit: of its sensors each by its own id."""
+    if table != "calibration":
+        return [(unit.unit_id, frame)]
+    sensors = {unit_id: [s for s in unit.ids if unit.ids[s] == unit_id] for unit_id in unit.ids.values()}
+    return [(unit_id, frame.filter(pl.col("sensor").is_in(own))) for unit_id, own in sensors.items()]
+
+
+def unit_lead(leading: FlightLead, unit: Unit) -> UnitLead:
+    """What leads every row of the history that speaks of a unit."""
+    return {**leading, "unit_id": unit.unit_id, "is_primary": unit.is_primary}
+
+
 def rows_frame(table: str, rows: Sequence[Mapping[str, object]]) -> pl.DataFrame:
     """Rows as a typed frame of `table`."""
     empty = frame(schemas.arrow_schema(table).empty_table())
     return pl.DataFrame(rows, schema=empty.schema, strict=False) if rows else empty
 
 
-def _faults(measured: Mapping[str, Json]) -> list[FindingFacts]:
+def _faults(step: str, measured: Mapping[str, Json]) -> list[FindingFacts]:
     """The faults that a stage found, as findings of the log."""
     listed = measured.get("faults")
+    _, table = stage_and_unit(step)
+    of_unit = "" if table == PRIMARY else f"{table}: "
     return [
-        {"code": str(fault["code"]), "count": 1, "sentence": str(fault["sentence"])}
+        {"code": str(fault["code"]), "count": 1, "sentence": f"{of_unit}{fault['sentence']}"}
         for fault in (listed if isinstance(listed, Sequence) else ())
         if isinstance(fault, Mapping)
     ]

@@ -32,6 +32,7 @@ from fieldcal.logs.rosbag1.reader import Rosbag1Log
 from fieldcal.logs.rosbag2.reader import Rosbag2Log
 from fieldcal.logs.ulog.reader import UlogLog
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas import signal_kind
 
 READERS: dict[str, Callable[[Path, Vehicle], LogReader]] = {
     "mcap": McapLog,
@@ -87,7 +88,7 @@ def batch_frame(table: str, columns: Columns) -> pl.DataFrame:
     "imu.1", have the columns of their kind."""
     rows = len(columns["t_ns"])
     series = []
-    for name in SIGNAL_COLUMNS[table.partition(".")[0]]:
+    for name in SIGNAL_COLUMNS[signal_kind(table)]:
         dtype = pl.Int64 if name == "t_ns" else pl.Float64
         if name in columns:
             series.append(pl.Series(name, np.ascontiguousarray(columns[name]), dtype))

@@ -27,11 +27,11 @@ class Applied(TypedDict):
 
 
 def applied(sources: Sequence[SensorSource], first_ns: int, last_ns: int) -> dict[str, Applied]:
-    """Sensor → what had been done to the primary unit's readings between two times, the mean over time; sensors whose
-    readings are raw are absent."""
+    """Sensor → what had been done to its readings between two times, the mean over time; sensors whose readings are
+    raw are absent. `sources`: one a sensor."""
     out: dict[str, Applied] = {}
     for source in sources:
-        if not source.primary or not source.corrections:
+        if not source.corrections:
             continue
         begins = np.array([one.from_ns for one in source.corrections], dtype=np.float64)
         ends = np.append(begins[1:], max(float(last_ns), begins[-1] + 1.0))

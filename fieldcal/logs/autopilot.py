@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fieldcal.logs.interface import Columns, LogSummary, SensorSource
 from fieldcal.logs.joining import imu_columns
+from fieldcal.logs.on_board import tell_further_units
 from fieldcal.reason_codes import ReasonCode
 
 MOST_INTERVALS_APART = 2.5
@@ -132,16 +133,7 @@ def tell_sources(summary: LogSummary, log_name: str, advice: str) -> None:
             f"published are constants of the raw sensor, composed with those parameters; rows residual_… hold for the "
             f"readings as logged.{told} {advice}",
         )
-    further = [source for source in summary.sources if not source.primary]
-    if further:
-        units = sorted({(source.table, source.unit_id) for source in further})
-        named = ", ".join(f"{table} ({unit_id})" for table, unit_id in units)
-        summary.add(
-            ReasonCode.FURTHER_UNITS,
-            len(units),
-            f"{log_name}: beside the primary units there are {len(units)} more on board, {named}; the primary ones are "
-            "calibrated.",
-        )
+    tell_further_units(summary, log_name)
 
 
 def tell_simulated(summary: LogSummary, log_name: str, why: str, *, expected: bool) -> None:

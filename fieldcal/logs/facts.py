@@ -35,9 +35,20 @@ class Judged(TypedDict):
     findings: list[FindingFacts]
 
 
+class UnitFacts(TypedDict):
+    """One unit on board. `table`: of its readings, "imu" of the primary one, which has the primary magnetometer as
+    well, "imu.1", "magnetometer.1", … of a further one. `devices`: what tells each of its sensors from others on board
+    (`SensorSource.unit_id`); empty where the log does not tell. `applied`: what an autopilot had done to the readings
+    of each sensor that enters the unit's estimate, the primary magnetometer's too."""
+
+    table: str
+    devices: dict[str, str]
+    applied: dict[str, Applied]
+
+
 class Facts(Declared, Judged):
-    """All of it. `rows` by signal table; `applied` by sensor; `position` mean latitude and longitude, degrees, and
-    altitude, m."""
+    """All of it. `rows` by signal table; `position` mean latitude and longitude, degrees, and altitude, m; `board_id`
+    the autopilot's serial number; `units_on_board` the primary one first."""
 
     duration_s: float | None
     imu_rate_hz: float | None
@@ -49,4 +60,5 @@ class Facts(Declared, Judged):
     temperature_max_degc: float | None
     started_at_ns: int | None
     position: list[float] | None
-    applied: dict[str, Applied]
+    board_id: str | None
+    units_on_board: list[UnitFacts]

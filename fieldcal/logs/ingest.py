@@ -19,13 +19,14 @@ from fieldcal.config.configuration import Vehicle
 from fieldcal.config.flight_settings import FlightSettings, flight_settings
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs import SIGNAL_COLUMNS, Finding, LogReader, LogSummary, open_log
-from fieldcal.logs.applied import applied
 from fieldcal.logs.discovery import folder_parts
 from fieldcal.logs.facts import Declared, Facts, FindingFacts, Judged
 from fieldcal.logs.interface import EPOCH_KNOWN_AFTER_NS
+from fieldcal.logs.on_board import PRIMARY, UNIT_TABLES, units_on_board
 from fieldcal.logs.tidy import HELD_ROWS, Disordered, TidySignal
 from fieldcal.names import SENSORS, Rotation, Sensor, Triple, Verdict
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas import signal_kind
 
 LEAST_SAMPLES = 10
 SECONDS_ALLOWED = 60.0
@@ -78,8 +79,6 @@ class TidyLog:
                     f"{self._name} was still being read after {self._seconds:.0f} s, {SECONDS_ALLOWED:.0f} s and 1 s "
                     "for every MB are allowed. Check the disk; the next night tries again.",
                 )
-            if table not in SIGNAL_COLUMNS:  # of a further unit
-                continue
             signal = self._signals.setdefault(table, TidySignal(table, self._held_rows))
             for frame in signal.add(columns):
                 yield table, self._seen(table, frame)
@@ -117,8 +116,26 @@ class TidyLog:
         return frame
 
     def _findings(self) -> list[Finding]:
-        own = [finding for signal in self._signals.values() for finding in signal.findings(self._name)]
+        own = [
+            finding if table in SIGNAL_COLUMNS else _of_further_unit(finding)
+            for table, signal in self._signals.items()
+            for finding in signal.findings(self._name)
+        ]
         return [*self._reader.summary.findings, *own, *self._apart()]
+
+    def _sound(self) -> list[str]:
+        """The further units' tables of which enough is sound, in the order of their numbers."""
+        return sorted(
+            (
+                table
+                for table, signal in self._signals.items()
+                if signal_kind(table) in UNIT_TABLES
+                and table not in SIGNAL_COLUMNS
+                and signal.rows >= LEAST_SAMPLES
+                and not any(finding.fatal for finding in signal.findings(self._name))
+            ),
+            key=lambda table: (signal_kind(table), len(table), table),
+        )
 
     def _apart(self) -> Iterator[Finding]:
         """A magnetometer whose stamps lie all before or all after the IMU's: nothing can lay them beside each other."""
@@ -157,7 +174,8 @@ class TidyLog:
             "temperature_max_degc": high,
             "started_at_ns": first_ns if summary.epoch_known and first_ns > EPOCH_KNOWN_AFTER_NS else None,
             "position": [float(v) for v in self._position / place.rows] if place and place.rows else None,
-            "applied": applied(summary.sources, first_ns, last_ns),
+            "board_id": summary.board_id,
+            "units_on_board": units_on_board(summary.sources, self._sound(), first_ns, last_ns),
             **verdict(findings),
         }
 
@@ -175,6 +193,11 @@ def logged_units(path: Path, vehicle: Vehicle) -> dict[str, str]:
     for _ in reader.batches():
         pass
     return dict(reader.summary.units)
+
+
+def _of_further_unit(finding: Finding) -> Finding:
+    """What ends the use of a further unit's readings does not end the flight's."""
+    return replace(finding, fatal=False, loses_data=finding.loses_data or finding.fatal)
 
 
 def declared(summary: LogSummary) -> Declared:
@@ -212,7 +235,8 @@ def rejected(reason_code: ReasonCode, reason: str) -> Facts:
         "temperature_max_degc": None,
         "started_at_ns": None,
         "position": None,
-        "applied": {},
+        "board_id": None,
+        "units_on_board": [],
         **declared(LogSummary("")),
         "rows": {},
         "verdict": Verdict.REJECTED,
@@ -244,8 +268,8 @@ def started_at(facts: Facts) -> datetime | None:
     return None if stamp is None else EPOCH + timedelta(microseconds=stamp // 1000)
 
 
-def settings_of(facts: Facts, vehicle: Vehicle) -> FlightSettings:
-    """Settings of the stages for this flight (`config.flight_settings.flight_settings`)."""
+def settings_of(facts: Facts, vehicle: Vehicle, unit: str = PRIMARY) -> FlightSettings:
+    """Settings of the stages for a unit of this flight (`config.flight_settings.flight_settings`)."""
     place = facts["position"]
     own = flight_settings(
         vehicle,
@@ -256,9 +280,11 @@ def settings_of(facts: Facts, vehicle: Vehicle) -> FlightSettings:
         position=None if place is None else (place[0], place[1], place[2]),
         started_at=started_at(facts),
     )
-    known = {Sensor(name): found for name, found in facts["applied"].items()}
+    on_board = next((one for one in facts["units_on_board"] if one["table"] == unit), None)
+    known = {} if on_board is None else {Sensor(name): found for name, found in on_board["applied"].items()}
     return replace(
         own,
+        own_sensors=SENSORS if unit == PRIMARY else UNIT_TABLES[signal_kind(unit)],
         applied_matrix={s: _rows_of(known[s]["matrix"]) if s in known else None for s in SENSORS},
         applied_offset={s: _triple(known[s]["offset"]) if s in known else None for s in SENSORS},
         applied_known={s: known[s]["known"] if s in known else None for s in SENSORS},

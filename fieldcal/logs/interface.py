@@ -89,9 +89,10 @@ class SensorSource:
     """One sensor of one unit on board: what it is, and where in the log its readings are.
 
     `table`: the signal table that they come in: "imu" and "magnetometer" of the primary unit, "imu.1", "imu.2",
-    "magnetometer.1", … of the further ones. `unit_id` names the unit within the vehicle: by device id, else by frame,
-    else by instance. `stream`: message or topic, with its instance. `filtered`: low-passed, or averaged over
-    intervals, by the autopilot. `corrections`: in order of `from_ns`; empty where the readings are raw.
+    "magnetometer.1", … of the further ones. `unit_id` names the unit within the vehicle: by device id, else by topic
+    and frame, else by instance; empty where it is the vehicle's `imu_id`. `stream`: message or topic, with its
+    instance. `filtered`: low-passed, or averaged over intervals, by the autopilot. `corrections`: in order of
+    `from_ns`; empty where the readings are raw.
     """
 
     sensor: Sensor
@@ -119,6 +120,7 @@ class LogSummary:
     `epoch_known`: stamps are Unix time. `verifiable`: every delivered sample was under a checksum that held.
     `counts`: signal table -> delivered rows. `metadata`: text pairs found in the log (of an autopilot: hardware,
     firmware, board id). `sources`: where each sensor's readings came from, where one log may hold several units.
+    `board_id`: serial number of the autopilot's board.
     """
 
     log_format: str
@@ -132,6 +134,7 @@ class LogSummary:
     counts: dict[str, int] = field(default_factory=dict)
     metadata: dict[str, str] = field(default_factory=dict)
     sources: list[SensorSource] = field(default_factory=list)
+    board_id: str | None = None
 
     def add(
         self, code: ReasonCode, count: int, sentence: str, *, loses_data: bool = False, fatal: bool = False

@@ -14,6 +14,7 @@ from fieldcal.errors import UnreadableLog
 from fieldcal.estimation.segments import begins_run
 from fieldcal.logs import SIGNAL_COLUMNS, Columns, Finding, batch_frame, stamps
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas import signal_kind
 
 SENSOR_TABLES = ("imu", "magnetometer", "vps")
 MAY_BE_UNKNOWN = ("px_m", "py_m", "pz_m", "altitude_m", "current_a", "throttle", "velocity_sd_mps")
@@ -121,7 +122,7 @@ class TidySignal:
         return float(1e9 / np.median(self._intervals))
 
     def _finite(self, frame: pl.DataFrame) -> pl.DataFrame:
-        names = [n for n in SIGNAL_COLUMNS[self.table] if n != "t_ns" and n not in MAY_BE_UNKNOWN]
+        names = [n for n in SIGNAL_COLUMNS[signal_kind(self.table)] if n != "t_ns" and n not in MAY_BE_UNKNOWN]
         whole = frame.filter(pl.all_horizontal(pl.col(names).is_finite().fill_null(True)))
         self.not_finite += len(frame) - len(whole)
         return whole
@@ -150,7 +151,7 @@ class TidySignal:
             leaders = np.flatnonzero(first)[np.cumsum(first) - 1]
             others = np.flatnonzero(~first)
             one, other = frame[leaders[others]], frame[others]
-            same = [other[n].eq_missing(one[n]).to_numpy() for n in SIGNAL_COLUMNS[self.table]]
+            same = [other[n].eq_missing(one[n]).to_numpy() for n in SIGNAL_COLUMNS[signal_kind(self.table)]]
             copy[others] = np.logical_and.reduce(same)
         return first, copy
 
@@ -191,7 +192,7 @@ class TidySignal:
 
     def findings(self, name: str) -> Iterator[Finding]:
         """What was met, as findings on the log called `name`."""
-        table, sensors = self.table, self.table in SENSOR_TABLES
+        table, sensors = self.table, signal_kind(self.table) in SENSOR_TABLES
         yield from self._clock_findings(name)
         if self.not_finite:
             yield Finding(
@@ -225,7 +226,7 @@ class TidySignal:
             )
 
     def _clock_findings(self, name: str) -> Iterator[Finding]:
-        table, sensors = self.table, self.table in SENSOR_TABLES
+        table, sensors = self.table, signal_kind(self.table) in SENSOR_TABLES
         if self._unwrap.wraps:
             yield Finding(
                 ReasonCode.CLOCK_WRAPPED,

@@ -46,10 +46,10 @@ def plot_frame(frame: pl.DataFrame, sensor: str | None, parameter: str | None) -
 
 
 def plot_history(rows: pl.DataFrame, title: str) -> list[Axes]:
-    """Rows of one sensor and parameter, a panel an axis, a colour an IMU: values ±1 sd over the flights."""
+    """Rows of one sensor and parameter, a panel an axis, a colour a unit: values ±1 sd over the flights."""
     names = sorted(rows["axis"].unique().to_list())
     axes = stacked(len(names), title=title, sharex=True)
-    identity = "imu_id" if "imu_id" in rows.columns else "method"
+    identity = "unit_id" if "unit_id" in rows.columns else "method"
     shown = rows[identity].unique(maintain_order=True).to_list()
     for axis, name in zip(axes, names, strict=True):
         here = rows.filter(pl.col("axis") == name)
@@ -70,19 +70,19 @@ def plot_history(rows: pl.DataFrame, title: str) -> list[Axes]:
 
 
 def plot_drift(rows: pl.DataFrame, title: str) -> list[Axes]:
-    """Rows of one sensor and parameter, a row of panels an axis, a colour an IMU: the trend over time and over
+    """Rows of one sensor and parameter, a row of panels an axis, a colour a unit: the trend over time and over
     temperature, ±2 sd, as far as it was flown."""
     names = sorted(rows["axis"].unique().to_list())
     axes = panels(len(names), 2, title=title, sharex="col", width_in=11.0)
-    shown = rows["imu_id"].unique(maintain_order=True).to_list()[:MOST_CURVES]
+    shown = rows["unit_id"].unique(maintain_order=True).to_list()[:MOST_CURVES]
     for (in_time, warm), name in zip(axes, names, strict=True):
-        for colour, imu in zip(COLOURS, shown, strict=False):
+        for colour, own in zip(COLOURS, shown, strict=False):
             for row in typed(
-                rows.filter(pl.col("axis") == name, pl.col("imu_id") == imu).iter_rows(named=True), DriftRow
+                rows.filter(pl.col("axis") == name, pl.col("unit_id") == own).iter_rows(named=True), DriftRow
             ):
                 if row["value_at_25degc"] is None:
                     continue
-                _trend_in_time(in_time, row, colour, f"{imu}: {row['status']}")
+                _trend_in_time(in_time, row, colour, f"{own}: {row['status']}")
                 _trend_over_temperature(warm, row, colour)
         in_time.set_ylabel(f"{name} at 25 °C ({unit(rows['unit'][0])})")
         legend(in_time, 3)

@@ -18,7 +18,7 @@ from fieldcal.report.trend import change_sentence, worst_status
 from fieldcal.report.words import age, day, plain_name, with_unit
 from fieldcal.schemas.rows import DriftRow, FitRow, FlightRow
 from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.questions import existing
+from fieldcal.warehouse.questions import existing, units_flown
 from fieldcal.words.numbers import number
 from fieldcal.words.rows import typed
 
@@ -56,14 +56,17 @@ def fleet_page(root: Path, links: Links, as_of: datetime | None) -> Page:
     vehicles = sorted(flights["vehicle_id"].unique().to_list())
     last = {row["vehicle_id"]: row for row in typed(usable.iter_rows(named=True), UsableFlight)}
     worst = _worst_tics(warehouse, last)
-    trends = {str(key[0]): part for key, part in drift.partition_by("imu_id", as_dict=True).items()}
-    sparks = key_parameters(warehouse, trends)
+    flown = units_flown(warehouse)
+    on_board = flown.select("vehicle_id", "unit_id").unique().sort("vehicle_id", "unit_id")
+    of_vehicles = on_board.join(drift.drop("vehicle_id"), on="unit_id", maintain_order="left_right")
+    trends = {str(key[0]): part for key, part in of_vehicles.partition_by("vehicle_id", as_dict=True).items()}
+    sparks = key_parameters(warehouse, flown, trends)
     rows, statuses = [], dict.fromkeys((*GRAVEST_FIRST, NOT_ANALYSED), 0)
     for key, part in (
         flights.sort("vehicle_id", "started_at", "flight_id").partition_by("vehicle_id", as_dict=True).items()
     ):
         vehicle = str(key[0])
-        status = worst_status(trends.get(part["imu_id"][-1]))
+        status = worst_status(trends.get(vehicle))
         statuses[status or NOT_ANALYSED] += 1
         rows.append(
             _row(vehicle, part, status, last.get(vehicle), worst.get(vehicle), sparks.get(vehicle), links, moment)
@@ -78,7 +81,8 @@ def fleet_page(root: Path, links: Links, as_of: datetime | None) -> Page:
     ]
     overview: list[Part] = [
         Table(
-            "A row per vehicle (fieldcal report --vehicle V writes its page). Status: the worst of its IMU's trends.",
+            "A row per vehicle (fieldcal report --vehicle V writes its page). Status: the worst of what it flew with"
+            " last.",
             _COLUMNS,
             rows,
         ),
@@ -136,6 +140,7 @@ def _worst_tics(warehouse: Warehouse, last: Mapping[str, UsableFlight]) -> dict[
     rows = (
         warehouse.scan("fit")
         .filter(pl.col("flight_id").is_in(wanted) & (pl.col("signal") == "smoothed") & pl.col("tic").is_not_null())
+        .filter("is_primary")
         .sort("tic", "quantity", "method", "reference")
         .collect()
     )
@@ -143,9 +148,9 @@ def _worst_tics(warehouse: Warehouse, last: Mapping[str, UsableFlight]) -> dict[
 
 
 def _siblings(drift: pl.DataFrame, row: DriftRow) -> list[float]:
-    """Values at 25 °C of the same parameter of the fleet's other IMUs."""
+    """Values at 25 °C of the same parameter of the fleet's other units."""
     same = (pl.col(name) == row[name] for name in SERIES)
-    others = drift.filter(*same, pl.col("imu_id") != row["imu_id"], pl.col("value_at_25degc").is_not_null())
+    others = drift.filter(*same, pl.col("unit_id") != row["unit_id"], pl.col("value_at_25degc").is_not_null())
     return others["value_at_25degc"].to_list()
 
 
@@ -161,7 +166,7 @@ def _unsteady(drift: pl.DataFrame) -> list[DriftRow]:
 
 
 def _place(row: DriftRow) -> tuple[str, ...]:
-    return row["imu_id"], row["sensor"], row["method"], row["axis"], row["status"]
+    return row["unit_id"], row["sensor"], row["method"], row["axis"], row["status"]
 
 
 def _looks(drift: pl.DataFrame, links: Links) -> list[Part]:
@@ -173,19 +178,19 @@ def _looks(drift: pl.DataFrame, links: Links) -> list[Part]:
         key=lambda row: (
             order.get(row["status"], 9),
             row["vehicle_id"],
-            row["imu_id"],
+            row["unit_id"],
             row["sensor"],
             row["parameter"],
             row["method"],
             row["axis"],
         ),
     )
-    few = sorted({row["imu_id"] for row in drift.iter_rows(named=True) if row["status"] == DriftStatus.INSUFFICIENT})
+    few = sorted({row["unit_id"] for row in drift.iter_rows(named=True) if row["status"] == DriftStatus.INSUFFICIENT})
     parts: list[Part] = []
     if found:
         columns = (
             Column("vehicle"),
-            Column("IMU", "id"),
+            Column("unit", "id"),
             Column("parameter"),
             Column("status"),
             Column("what", "wide"),
@@ -194,7 +199,7 @@ def _looks(drift: pl.DataFrame, links: Links) -> list[Part]:
         rows = [
             [
                 links.to(vehicle_name(row["vehicle_id"]), row["vehicle_id"]),
-                row["imu_id"],
+                row["unit_id"],
                 f"{plain_name(row['sensor'])} {row['parameter']} {row['axis']} ({plain_name(row['method'])})",
                 badge(row["status"]),
                 change_sentence(row, _siblings(drift, row) if row["status"] == DriftStatus.OUTLIER else []),

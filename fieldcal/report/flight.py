@@ -18,6 +18,7 @@ from fieldcal.report.page import Column, Folded, Notice, Page, Part, Section, Ta
 from fieldcal.report.words import count, day, plain_name, scientific, unit, with_unit
 from fieldcal.schemas.rows import CalibrationRow, FitRow, UnfoldedFlight, UnfoldedRun
 from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
+from fieldcal.stages.tables import AXES
 from fieldcal.words.flights import QUANTITIES, advised, is_consequence, sync_sentence
 from fieldcal.words.numbers import cell, number
 from fieldcal.words.rows import BESIDE, standing, typed
@@ -44,6 +45,7 @@ def flight_page(data: FlightData, links: Links) -> Page:
     sections = [
         Section("refused", "Refusals and findings", _refusals(data)),
         Section("constants", "Constants (Tables 2–4)", _constants(data.calibration)),
+        *([] if data.further.is_empty() else [Section("units", "Further units on board", _further(data.further))]),
         Section("agreement", "Agreement (Eq. 16)", _agreement(data)),
         *_figures(data),
         Section("stages", "Stages", _stages(data)),
@@ -167,6 +169,42 @@ def _paper_table(rows: Sequence[CalibrationRow], caption: str, letter: str) -> T
     ]
     degc = next((r["temperature_degc"] for r in rows if r["temperature_degc"] is not None), None)
     return Table(caption + ("" if degc is None else f", at {degc:.1f} °C"), columns, lines)
+
+
+def _further(calibration: pl.DataFrame) -> list[Part]:
+    """The constants that count of each unit beside the primary ones."""
+    rows = typed(calibration.iter_rows(named=True), CalibrationRow)
+    by_place: dict[tuple[str, str, str], dict[str, CalibrationRow]] = {}
+    for row in rows:
+        if row["parameter"] in ("scale", "zero") and row["axis"] in AXES and row["method"] != WARM_UP:
+            place = by_place.setdefault((row["unit_id"], row["sensor"], row["parameter"]), {})
+            kept = place.get(row["axis"])
+            if kept is None or _rank(row) < _rank(kept):
+                place[row["axis"]] = row
+    columns = [Column("unit", "id"), Column("parameter"), *(Column(axis, "n") for axis in AXES), Column("unit of it")]
+    lines = [
+        [
+            unit_id,
+            f"{sensor} {parameter}",
+            *(_told(own[axis]) if axis in own else "–" for axis in AXES),
+            unit(next(iter(own.values()))["unit"]),
+        ]
+        for (unit_id, sensor, parameter), own in by_place.items()
+    ]
+    return [
+        Text("Each IMU was calibrated with the primary magnetometer, each magnetometer with the primary IMU."),
+        Table("Scale and zero, ± one standard deviation", columns, lines),
+    ]
+
+
+def _rank(row: CalibrationRow) -> tuple[bool, int]:
+    return row["status"] != Status.OK, exactness(row["method"])
+
+
+def _told(row: CalibrationRow) -> str:
+    if row["status"] == Status.OK:
+        return scientific(row["value"], row["sd"])
+    return standing(row["status"], row["reason_code"])
 
 
 def _agreement(data: FlightData) -> list[Part]:

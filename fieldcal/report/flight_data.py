@@ -45,7 +45,7 @@ class FlightData:
     """One flight. `tables` are named `stage.table` as in the pipeline, `parameters` are the stages' settings as plain
     JSON, `settings` what the figures need of them, None where they do not say.
 
-    `gone` names stages whose tables should be there and are not.
+    `gone` names stages whose tables should be there and are not. `further`: rows of `calibration` of further units.
     """
 
     flight: UnfoldedFlight
@@ -57,6 +57,7 @@ class FlightData:
     parameters: Mapping[str, Json]
     settings: FigureSettings | None
     gone: tuple[str, ...] = field(default=())
+    further: pl.DataFrame = field(default_factory=lambda: rows_frame("calibration", ()))
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -77,7 +78,8 @@ def read_flight(root: Path, flight_id: str) -> FlightData:
     warehouse = existing(root)
     flight = typed(map(unfolded, rows_of(_one_flight(warehouse, flight_id))), UnfoldedFlight)[0]
     ids = {"vehicle_id": flight["vehicle_id"], "flight_id": flight["flight_id"]}
-    history = {name: warehouse.scan(name, **ids).collect() for name in ("calibration", "fit", "sync", "run")}
+    every = {name: warehouse.scan(name, **ids).collect() for name in ("calibration", "fit", "sync", "run")}
+    history = {name: rows.filter("is_primary") for name, rows in every.items()}
     order = {stage: i for i, stage in enumerate(("ingest", *(stage.name for stage in PIPELINE)))}
     run = typed(map(unfolded, rows_of(history["run"])), UnfoldedRun)
     run.sort(key=lambda row: order.get(row["stage"], len(order)))
@@ -98,6 +100,7 @@ def read_flight(root: Path, flight_id: str) -> FlightData:
         parameters,
         from_json(parameters, FigureSettings),
         gone,
+        every["calibration"].filter(~pl.col("is_primary")),
     )
 
 

@@ -36,6 +36,7 @@ class RefusedRow(TypedDict):
     started_at: datetime | None
     flight_id: str
     level: str
+    unit_id: str | None
     what: str
     status: str
     reason_code: str | None

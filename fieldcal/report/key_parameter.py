@@ -19,20 +19,21 @@ LEVELS = ("zero_bias", "bias", "scale")
 Place = tuple[str, str, str, str]
 
 
-def key_parameters(warehouse: Warehouse, trends: Mapping[str, pl.DataFrame]) -> dict[str, tuple[str, str]]:
-    """For each vehicle the key parameter of its present IMU, in words and drawn. `trends`: `drift` by IMU."""
+def key_parameters(
+    warehouse: Warehouse, flown: pl.DataFrame, trends: Mapping[str, pl.DataFrame]
+) -> dict[str, tuple[str, str]]:
+    """For each vehicle the key parameter of its present units (`units_flown`), in words and drawn. `trends`: their
+    rows of `drift` by vehicle."""
     rows = (
         warehouse.scan("calibration")
         .filter((pl.col("status") == Status.OK) & pl.col("value").is_not_null())
-        .select("vehicle_id", "imu_id", *PLACE, "value", "unit", "started_at", "flight_id")
+        .select("vehicle_id", "unit_id", *PLACE, "value", "unit", "started_at", "flight_id")
         .sort("started_at", "flight_id", nulls_last=False)
         .collect()
     )
-    told = {}
-    for (vehicle,), own in rows.partition_by("vehicle_id", as_dict=True).items():
-        imu = own["imu_id"][-1]
-        told[str(vehicle)] = _drawn(own.filter(pl.col("imu_id") == imu), trends.get(imu))
-    return told
+    present = rows.join(flown, on=["vehicle_id", "unit_id", "sensor"], how="semi", maintain_order="left")
+    by_vehicle = present.partition_by("vehicle_id", as_dict=True)
+    return {str(vehicle): _drawn(own, trends.get(str(vehicle))) for (vehicle,), own in by_vehicle.items()}
 
 
 def _drawn(own: pl.DataFrame, drift: pl.DataFrame | None) -> tuple[str, str]:

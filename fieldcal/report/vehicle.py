@@ -22,7 +22,7 @@ from fieldcal.schemas.rows import DriftRow, UnfoldedFlight
 from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
 from fieldcal.stages.beside.warm_up import PARAMETER as WARM_UP_SLOPE
 from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.questions import existing
+from fieldcal.warehouse.questions import existing, units_flown
 from fieldcal.words.numbers import number
 from fieldcal.words.rows import typed, unfolded
 
@@ -41,8 +41,10 @@ def vehicle_page(root: Path, vehicle_id: str, links: Links, as_of: datetime | No
         raise FieldcalError(ReasonCode.NOT_FOUND, _no_vehicle(warehouse, vehicle_id))
     moment = as_of or newest(warehouse)
     imus = list(dict.fromkeys(reversed(flights["imu_id"].to_list())))
-    drift = warehouse.scan("drift").filter(pl.col("imu_id").is_in(imus)).collect()
-    current = drift.filter(pl.col("imu_id") == imus[0])
+    flown = units_flown(warehouse, vehicle_id)
+    units = _units(warehouse, vehicle_id, flown)
+    drift = warehouse.scan("drift").filter(pl.col("unit_id").is_in(units)).collect()
+    current = drift.filter(pl.col("unit_id").is_in(flown["unit_id"].to_list()))
     usable = usable_flights(warehouse, vehicle_id)
     status = worst_status(current)
     last = usable["started_at"][-1] if usable.height else None
@@ -55,13 +57,13 @@ def vehicle_page(root: Path, vehicle_id: str, links: Links, as_of: datetime | No
         ("IMU", imus[0] if len(imus) == 1 else f"{imus[0]}; before: {', '.join(imus[1:])}"),
     ]
     sections = [
-        Section("fly", "What to fly with", _fly_with(warehouse, imus[0])),
+        Section("fly", "What to fly with", _fly_with(warehouse, flown)),
         Section("trend", "Trends", _trends(current, usable.height)),
-        *_parameters(warehouse, vehicle_id, imus, drift),
+        *_parameters(warehouse, vehicle_id, units, drift),
         Section("agreement", "Agreement", _agreement(warehouse, vehicle_id)),
         Section("clock", "VPS clock", _clock(warehouse, vehicle_id)),
         Section("flights", "Flights", [_flights(flights, usable, links)]),
-        Section("refusals", "Refusals", _refusals(warehouse, vehicle_id, links)),
+        Section("refusals", "Refusals", _refusals(warehouse, vehicle_id, flown, links)),
     ]
     return Page(
         f"Vehicle {vehicle_id}",
@@ -82,8 +84,16 @@ def _no_vehicle(warehouse: Warehouse, vehicle_id: str) -> str:
     return f'No flight of a vehicle "{vehicle_id}" is in the history; {there}.'
 
 
-def _fly_with(warehouse: Warehouse, imu_id: str) -> list[Part]:
-    rows = warehouse.sql("SELECT * FROM latest_calibration WHERE imu_id = ?", [imu_id])
+def _units(warehouse: Warehouse, vehicle_id: str, flown: pl.DataFrame) -> list[str]:
+    """Units that the vehicle has carried: those it flew with last, then the others, the latest first."""
+    rows = warehouse.scan("calibration", vehicle_id=vehicle_id).select("unit_id", "started_at", "flight_id")
+    others = rows.sort("started_at", "flight_id", "unit_id", nulls_last=False).collect()["unit_id"].reverse()
+    primary = flown.sort("sensor", descending=True)["unit_id"].to_list()
+    return list(dict.fromkeys([*primary, *others.to_list()]))
+
+
+def _fly_with(warehouse: Warehouse, flown: pl.DataFrame) -> list[Part]:
+    rows = warehouse.sql("SELECT * FROM latest_calibration").join(flown, on=["unit_id", "sensor"], how="semi")
     if rows.is_empty():
         return [Notice("No flight gave a constant: there is nothing to fly with.")]
     axes = sorted(rows["axis"].unique().to_list())
@@ -128,7 +138,7 @@ def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
     if drift.is_empty():
         return [
             Notice(
-                f"Table drift has no row of this IMU ({count(usable, 'usable flight')}): trends are not analysed yet."
+                f"Table drift has no row of its units ({count(usable, 'usable flight')}): trends are not analysed yet."
             )
         ]
     parts: list[Part] = []
@@ -203,26 +213,25 @@ def _trend_table(caption: str, rows: Sequence[DriftRow]) -> Table:
     return Table(caption, columns, lines)
 
 
-def _parameters(warehouse: Warehouse, vehicle_id: str, imus: list[str], drift: pl.DataFrame) -> list[Section]:
-    """A section per sensor: the plots of its most exact method, the current IMU first."""
+def _parameters(warehouse: Warehouse, vehicle_id: str, units: list[str], drift: pl.DataFrame) -> list[Section]:
+    """A section per sensor: the plots of its most exact method, the unit that it flew with last first."""
     rows = (
         warehouse.scan("calibration")
-        .filter(pl.col("imu_id").is_in(imus) & pl.col("value").is_not_null())
+        .filter(pl.col("unit_id").is_in(units) & pl.col("value").is_not_null())
         .sort("started_at", "flight_id", nulls_last=False)
         .collect()
     )
-    panels = max(3 * len(imus), rows.select("imu_id", "axis").unique().height)
+    panels = max(3 * len(units), rows.select("unit_id", "axis").unique().height)
     most = max(FEWEST_POINTS, 3 * MOST_POINTS // panels)
     sections: list[Section] = []
     for sensor in sorted(rows["sensor"].unique().to_list(), key=lambda name: _place(SENSORS, name)):
         parts: list[Part] = []
-        for imu in imus:
-            own = rows.filter(pl.col("sensor") == sensor, pl.col("imu_id") == imu)
-            if own.is_empty():
-                continue
-            if len(imus) > 1:
-                parts.append(Heading(f"IMU {imu}"))
-            parts += _sensor(own, drift.filter(pl.col("sensor") == sensor, pl.col("imu_id") == imu), vehicle_id, most)
+        own_units = rows.filter(pl.col("sensor") == sensor)["unit_id"].unique().to_list()
+        for unit_id in (one for one in units if one in own_units):
+            here = pl.col("sensor") == sensor, pl.col("unit_id") == unit_id
+            if len(own_units) > 1:
+                parts.append(Heading(f"Unit {unit_id}"))
+            parts += _sensor(rows.filter(*here), drift.filter(*here), vehicle_id, most)
         sections.append(Section(f"sensor-{len(sections) + 1}", sensor.capitalize(), parts))
     return sections
 
@@ -235,7 +244,7 @@ def _sensor(rows: pl.DataFrame, drift: pl.DataFrame, vehicle_id: str, most: int)
 
 def _method(rows: pl.DataFrame, drift: pl.DataFrame, method: str, vehicle_id: str, most: int) -> list[Part]:
     rows = rows.filter(pl.col("method") == method)
-    sensor, imu = rows["sensor"][0], rows["imu_id"][0]
+    sensor, unit_id = rows["sensor"][0], rows["unit_id"][0]
     there = sorted(rows["parameter"].unique().to_list(), key=lambda name: (_place(PARAMETERS, name), name))
     parts: list[Part] = [Text(f"Method: {plain_name(method)}.")]
     folded: list[Simple] = []
@@ -244,7 +253,7 @@ def _method(rows: pl.DataFrame, drift: pl.DataFrame, method: str, vehicle_id: st
         trend = drift.filter(pl.col("method") == method, pl.col("parameter") == parameter)
         of_axes = typed(trend.iter_rows(named=True), DriftRow)
         by_axis = {r["axis"]: r for r in of_axes if r["status"] != DriftStatus.INSUFFICIENT}
-        anchor = f"plot-{_slug(sensor, parameter, imu)}"
+        anchor = f"plot-{_slug(sensor, parameter, unit_id)}"
         plot = parameter_plot(own, by_axis, vehicle_id, f"{sensor} {parameter}", anchor, most)
         (parts if parameter in OPEN else folded).append(plot)
     if folded:
@@ -260,12 +269,12 @@ def _slug(*names: str) -> str:
 
 
 def _agreement(warehouse: Warehouse, vehicle_id: str) -> list[Part]:
-    plot = agreement_plot(warehouse.scan("fit", vehicle_id=vehicle_id).collect(), "plot-agreement")
+    plot = agreement_plot(warehouse.scan("fit", vehicle_id=vehicle_id).filter("is_primary").collect(), "plot-agreement")
     return [Text("No flight has anything to compare with.")] if plot is None else [plot]
 
 
 def _clock(warehouse: Warehouse, vehicle_id: str) -> list[Part]:
-    sync = warehouse.scan("sync", vehicle_id=vehicle_id).collect()
+    sync = warehouse.scan("sync", vehicle_id=vehicle_id).filter("is_primary").collect()
     plot = lag_plot(sync, "plot-clock")
     refused = sync.filter(pl.col("status") != Status.OK).height
     parts: list[Part] = [Text("No flight was synchronised with a VPS.")] if plot is None else [plot]
@@ -307,14 +316,15 @@ def _flights(flights: pl.DataFrame, usable: pl.DataFrame, links: Links) -> Table
     return Table("Flights, the latest first (fieldcal report --flight ID writes a flight's page)", columns, lines, more)
 
 
-def _refusals(warehouse: Warehouse, vehicle_id: str, links: Links) -> list[Part]:
+def _refusals(warehouse: Warehouse, vehicle_id: str, flown: pl.DataFrame, links: Links) -> list[Part]:
     rows = warehouse.sql(
         "SELECT * FROM refusals WHERE vehicle_id = ? AND level <> 'parameter'"
-        " ORDER BY started_at DESC NULLS LAST, flight_id, level, what",
+        " ORDER BY started_at DESC NULLS LAST, flight_id, level, unit_id, what",
         [vehicle_id],
     )
     if rows.is_empty():
         return [Text("Nothing was refused.")]
+    primary = {None, *flown["unit_id"]}
     columns = (
         Column("flight"),
         Column("started (UTC)", "nowrap"),
@@ -327,7 +337,7 @@ def _refusals(warehouse: Warehouse, vehicle_id: str, links: Links) -> list[Part]
         [
             links.to(flight_name(r["flight_id"]), r["flight_id"]),
             day(r["started_at"]),
-            f"{r['level']} {r['what']}",
+            f"{r['level']} {r['what']}" + ("" if r["unit_id"] in primary else f" of {r['unit_id']}"),
             badge(r["status"]),
             r["reason_code"] or "",
             reason_of(r),

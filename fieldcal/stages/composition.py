@@ -24,7 +24,7 @@ SQUARE = 1e-9
 
 def compose(tables: Tables, s: CompositionSettings) -> StageResult:
     """Calibration of the logged readings → calibration of the raw ones, in the axes of the logged; those of the logged
-    beside, as `residual_`, where the two differ.
+    beside, as `residual_`, where the two differ. Only of the unit's own sensors.
 
     z = Λ logged + b and logged = P raw + o make z = (Λ P) raw + (Λ o + b): the zero is P⁻¹ (zero − o)."""
     parts = [tables[name] for name in ("calibration", "warm_up") if name in tables]
@@ -32,7 +32,7 @@ def compose(tables: Tables, s: CompositionSettings) -> StageResult:
         return StageResult(
             status=Status.REFUSED, reason_code=ReasonCode.NOTHING_CALIBRATED, reason="No method gave constants."
         )
-    rows = pl.concat(parts)
+    rows = pl.concat(parts).filter(pl.col("sensor").is_in(s.own_sensors))
     of_matrix, of_offset, is_known = s.applied_matrix, s.applied_offset, s.applied_known
     matrix_sd, offset_sd = s.applied_matrix_sd, s.applied_offset_sd
     out = [rows.filter(~pl.col("sensor").is_in([name for name in SENSORS if of_matrix[name] is not None]))]

@@ -10,11 +10,15 @@ import polars as pl
 
 from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.config.stage_settings import StageSettings, names_of, taken_from
+from fieldcal.logs.on_board import PRIMARY
 from fieldcal.names import VECTOR_SENSORS, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import SchemaMismatch, conform
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.results import StageResult, fatal_fault
+
+AT = "@"
+"""Between a stage and the further unit on board that it ran for."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,17 @@ class Stage:
     def settings(self) -> tuple[str, ...]:
         """Names of the settings that enter its run key."""
         return names_of(self.takes)
+
+
+def step_of(stage: str, table: str) -> str:
+    """Name of a stage's step of the unit whose readings are in `table`."""
+    return stage if table == PRIMARY else f"{stage}{AT}{table}"
+
+
+def stage_and_unit(step: str) -> tuple[str, str]:
+    """(stage, table of the unit) of a step."""
+    stage, _, table = step.partition(AT)
+    return stage, table or PRIMARY
 
 
 def run_stage(stage: Stage, tables: Mapping[str, pl.DataFrame], settings: FlightSettings) -> StageResult:

@@ -21,7 +21,7 @@ STATUSES = GRAVEST_FIRST[:3]
 KINDS: tuple[str, ...] = (*STATUSES, "last_flight", "recovered", "expired", "idle")
 TELLING = ("zero_bias", "zero", "scale", "bias")
 """Which parameter speaks for an axis first: the best conditioned."""
-SERIES = ["imu_id", "sensor", "method", "parameter", "axis"]
+SERIES = ["unit_id", "sensor", "method", "parameter", "axis"]
 
 
 class PlainChange(TypedDict):
@@ -30,6 +30,7 @@ class PlainChange(TypedDict):
     kind: str
     vehicle_id: str
     imu_id: str | None
+    unit_id: str | None
     sensor: str | None
     axis: str | None
     parameters: list[str]
@@ -44,6 +45,7 @@ class Change:
     kind: str
     vehicle_id: str
     imu_id: str | None
+    unit_id: str | None
     sensor: str | None
     axis: str | None
     parameters: tuple[str, ...]
@@ -55,6 +57,7 @@ class Change:
             "kind": self.kind,
             "vehicle_id": self.vehicle_id,
             "imu_id": self.imu_id,
+            "unit_id": self.unit_id,
             "sensor": self.sensor,
             "axis": self.axis,
             "parameters": list(self.parameters),
@@ -91,14 +94,14 @@ def changes(
 
 
 def last_usable(root: Path) -> pl.DataFrame:
-    """vehicle_id, imu_id, sensor, last_at: latest flight with a time that calibrated each sensor."""
+    """vehicle_id, imu_id, unit_id, sensor, last_at: latest flight with a time that calibrated each sensor."""
     return (
         Warehouse(root)
         .scan("calibration")
         .filter((pl.col("status") == Status.OK) & pl.col("started_at").is_not_null())
-        .group_by("vehicle_id", "imu_id", "sensor")
+        .group_by("vehicle_id", "imu_id", "unit_id", "sensor")
         .agg(last_at=pl.col("started_at").max())
-        .sort("vehicle_id", "imu_id", "sensor")
+        .sort("vehicle_id", "imu_id", "unit_id", "sensor")
         .collect()
     )
 
@@ -124,25 +127,27 @@ def _news(both: pl.DataFrame) -> Iterable[Change]:
         for name, order in ranked
     ]
     news = both.with_columns(kind=kind).filter(pl.col("kind").is_not_null())
-    groups = ["kind", "imu_id", "sensor", "axis"]
-    for (name, imu_id, sensor, axis), rows in news.sort(*groups, *rank).group_by(groups, maintain_order=True):
+    groups = ["kind", "unit_id", "sensor", "axis"]
+    for (name, unit_id, sensor, axis), rows in news.sort(*groups, *rank).group_by(groups, maintain_order=True):
         first = rows.row(0, named=True)
         about = f"agreement with {axis}" if sensor == AGREEMENT else f"{sensor} {axis}".strip()
         what = first["reason"] or f"{first['status_before']} no more."
         yield Change(
             kind=str(name),
             vehicle_id=first["vehicle_id"],
-            imu_id=str(imu_id),
+            imu_id=first["imu_id"],
+            unit_id=str(unit_id),
             sensor=str(sensor),
             axis=str(axis),
             parameters=tuple(dict.fromkeys(rows["parameter"].to_list())),
-            sentence=f"{first['vehicle_id']}, {imu_id}, {about}, {first['parameter']}: {what}",
+            sentence=f"{first['vehicle_id']}, {unit_id}, {about}, {first['parameter']}: {what}",
         )
 
 
 def _ages(latest: pl.DataFrame, now: datetime, since: datetime | None, alerts: Alerts) -> Iterable[Change]:
-    """Sensors and vehicles that passed the limit since the night before. An IMU counts where it flew last."""
-    current = latest.sort("last_at").unique(["imu_id", "sensor"], keep="last").sort("vehicle_id", "imu_id", "sensor")
+    """Sensors and vehicles that passed the limit since the night before. A unit counts where it flew last."""
+    current = latest.sort("last_at").unique(["unit_id", "sensor"], keep="last")
+    current = current.sort("vehicle_id", "unit_id", "sensor")
     for row in current.iter_rows(named=True):
         if _passed(row["last_at"], now, since, alerts.expires_days):
             days = (now - row["last_at"]).days
@@ -150,10 +155,11 @@ def _ages(latest: pl.DataFrame, now: datetime, since: datetime | None, alerts: A
                 kind="expired",
                 vehicle_id=row["vehicle_id"],
                 imu_id=row["imu_id"],
+                unit_id=row["unit_id"],
                 sensor=row["sensor"],
                 axis=None,
                 parameters=(),
-                sentence=f"{row['vehicle_id']}, {row['imu_id']}, {row['sensor']}: last calibrated {days} days ago,"
+                sentence=f"{row['vehicle_id']}, {row['unit_id']}, {row['sensor']}: last calibrated {days} days ago,"
                 f" on {row['last_at']:%Y-%m-%d}; it counts for {alerts.expires_days:g} days.",
             )
     flown = latest.group_by("vehicle_id").agg(pl.col("last_at").max()).sort("vehicle_id")
@@ -163,6 +169,7 @@ def _ages(latest: pl.DataFrame, now: datetime, since: datetime | None, alerts: A
                 kind="idle",
                 vehicle_id=vehicle_id,
                 imu_id=None,
+                unit_id=None,
                 sensor=None,
                 axis=None,
                 parameters=(),

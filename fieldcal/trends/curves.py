@@ -22,8 +22,8 @@ from fieldcal.warehouse import Warehouse
 
 Source = tuple[Array, Array]
 """Coefficients (3,) at 25 °C and their information (3, 3)."""
-Bends = Mapping[tuple[str, str], Source]
-"""What each warm-up flight says: (flight, axis) → source, in logged units."""
+Bends = Mapping[tuple[str, str, str], Source]
+"""What each warm-up flight says: (flight, unit, axis) → source, in logged units."""
 
 
 @dataclass(frozen=True)
@@ -48,15 +48,15 @@ class Bent:
 def bends_of(root: Path) -> Bends:
     """Every warm-up flight's curve, from the measured numbers of its run."""
     runs = Warehouse(root).scan("run").filter((pl.col("stage") == METHOD) & (pl.col("status") == Status.OK))
-    found: dict[tuple[str, str], Source] = {}
-    for flight_id, text in runs.select("flight_id", "measured").collect().iter_rows():
+    found: dict[tuple[str, str, str], Source] = {}
+    for flight_id, unit_id, text in runs.select("flight_id", "unit_id", "measured").collect().iter_rows():
         curve = json.loads(text or "{}").get(CURVE)
         if curve is None:
             continue
         for i, axis in enumerate("xyz"):
             cubic = np.array(curve["coefficients"][i]), np.array(curve["covariance"][i])
             if np.linalg.matrix_rank(cubic[1], hermitian=True) == ORDER:
-                found[flight_id, axis] = about_reference(*cubic, curve["centre_degc"], curve["width_degc"])
+                found[flight_id, unit_id, axis] = about_reference(*cubic, curve["centre_degc"], curve["width_degc"])
     return found
 
 
@@ -68,23 +68,23 @@ def bent(flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends: Trends
     warm = _warm(flights, bends)
     if not warm:
         return None
-    place = {key: i for i, key in enumerate(rows.select("imu_id", "method", "parameter", "axis").iter_rows())}
+    place = {key: i for i, key in enumerate(rows.select("unit_id", "method", "parameter", "axis").iter_rows())}
     gyroscope = (rows["sensor"] == "gyroscope").to_numpy()
     value = h.value.copy()
     slope, slope_sd = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
     bend, bend_sd, wider = np.full((len(rows), 2), np.nan), np.full((len(rows), 2), np.nan), np.ones((len(rows), 2))
-    for (imu_id, method, parameter, axis), i in place.items():
-        if parameter != "zero" or not gyroscope[i] or (imu_id, axis) not in warm:
+    for (unit_id, method, parameter, axis), i in place.items():
+        if parameter != "zero" or not gyroscope[i] or (unit_id, axis) not in warm:
             continue
-        curve = combined(warm[imu_id, axis], _sessions(h, i, trends))
+        curve = combined(warm[unit_id, axis], _sessions(h, i, trends))
         if curve is None:
             continue
-        warm_slope = _slope_given(curve, warm[imu_id, axis]) if curve.agrees is not False else (np.nan, np.nan)
+        warm_slope = _slope_given(curve, warm[unit_id, axis]) if curve.agrees is not False else (np.nan, np.nan)
         lever = {"zero": 1.0}
-        if (scale := place.get((imu_id, method, "scale", axis))) is not None:
+        if (scale := place.get((unit_id, method, "scale", axis))) is not None:
             lever["zero_bias"] = -float(trends.value[scale])
         for name, factor in lever.items():
-            j = place.get((imu_id, method, name, axis))
+            j = place.get((unit_id, method, name, axis))
             if j is None or not np.isfinite(factor):
                 continue
             members = _members(h, j)
@@ -93,7 +93,7 @@ def bent(flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends: Trends
             of_scale = SCALE_PER_DEGC_SD * abs(float(trends.value[j])) if name == "zero_bias" else 0.0
             slope[j], slope_sd[j] = factor * warm_slope[0], np.hypot(factor * warm_slope[1], of_scale)
             members, variance = _flights(h, j, trends)
-            by_warm_up = None if curve.agrees is False else warm[imu_id, axis][1] / factor**2
+            by_warm_up = None if curve.agrees is False else warm[unit_id, axis][1] / factor**2
             wider[j] = widening(h.temperature_degc[members], h.time_day[members], variance, by_warm_up)
             bend[j], bend_sd[j] = factor * curve.coefficients[1:], abs(factor) * curve.sd[1:]
     if np.isnan(bend).all():
@@ -102,12 +102,12 @@ def bent(flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends: Trends
 
 
 def _warm(flights: pl.DataFrame, bends: Bends) -> dict[tuple[str, str], Source]:
-    """(IMU, axis) → its warm-up flights' cubics combined; their scatter about the mean widens its sd."""
+    """(unit, axis) → its warm-up flights' cubics combined; their scatter about the mean widens its sd."""
     fitted = flights.filter(sensor="gyroscope", method=METHOD, parameter=PARAMETER)
     sources: dict[tuple[str, str], list[Source]] = {}
-    for imu_id, flight_id, axis in fitted.select("imu_id", "flight_id", "axis").iter_rows():
-        if (flight_id, axis) in bends:
-            sources.setdefault((imu_id, axis), []).append(bends[flight_id, axis])
+    for unit_id, flight_id, axis in fitted.select("unit_id", "flight_id", "axis").iter_rows():
+        if (flight_id, unit_id, axis) in bends:
+            sources.setdefault((unit_id, axis), []).append(bends[flight_id, unit_id, axis])
     result = {}
     for key, several in sources.items():
         cubics = np.stack([c for c, _ in several]), np.stack([n for _, n in several])

@@ -26,7 +26,7 @@ from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.store import empty_frame, read_table
 from fieldcal.words.rows import typed
 
-KEY = ["imu_id", "sensor", "method", "parameter", "axis"]
+KEY = ["unit_id", "sensor", "method", "parameter", "axis"]
 ALIKE = ("sensor", "method", "parameter", "unit")
 SIBLINGS = (*ALIKE, "axis")
 SIGNED = ("scale", "bias", "zero_bias")
@@ -37,9 +37,9 @@ ATTEMPTS = 10
 
 
 def update_drift(root: Path) -> tuple[str, ...]:
-    """Publish the trends of every IMU under the vehicle that carries it now; the vehicles whose table changed.
+    """Publish the trends of every unit under the vehicle that carries it now; the vehicles whose table changed.
 
-    A function of the history alone: the same history gives the same bytes, and then nothing is written. IMUs whose
+    A function of the history alone: the same history gives the same bytes, and then nothing is written. Units whose
     history did not change are not regressed again (`evidence_cache`); the fleet is judged anew from all. When another
     process publishes flights meanwhile, it is done again, so that whoever ends last leaves the trends of all.
 
@@ -112,7 +112,7 @@ def history_of_everything(root: Path) -> pl.DataFrame:
     flights with a time where any has one.
     """
     warehouse = Warehouse(root)
-    lead = ["vehicle_id", "imu_id", "session_id", "flight_id", "started_at"]
+    lead = ["vehicle_id", "imu_id", "unit_id", "session_id", "flight_id", "started_at"]
     columns = [*lead, "sensor", "method", "parameter", "axis", "value", "sd", "unit", "temperature_degc"]
     # What remains of an autopilot's own correction steps with its parameters, not with the sensor.
     own = (pl.col("status") == Status.OK) & ~pl.col("parameter").str.starts_with(RESIDUAL)
@@ -170,13 +170,13 @@ def trends_of(
         sd=flights["sd"].to_numpy(),
     )
     rows = numbered.group_by("row", maintain_order=True).agg(
-        *(pl.col(name).last() for name in (*KEY, "vehicle_id", "unit")),
+        *(pl.col(name).last() for name in (*KEY, "vehicle_id", "imu_id", "unit")),
         temperature_min_degc=pl.col("temperature_degc").min(),
         temperature_max_degc=pl.col("temperature_degc").max(),
     )
     kept = replace(kept, kind=_labels(rows, ALIKE))
-    imu = rows["imu_id"].rle_id().to_numpy()
-    trends = regression.judge(memory.of(kept, imu), kept.kind)
+    of_unit = rows["unit_id"].rle_id().to_numpy()
+    trends = regression.judge(memory.of(kept, of_unit), kept.kind)
     curves = bent(flights, kept, rows, trends, bends)
     if (slopes := slopes_of_warm_ups(flights, kept, rows, trends)) is not None:
         slope, slope_sd = slopes
@@ -185,7 +185,7 @@ def trends_of(
             kept = curves.histories
             slope, slope_sd = np.where(is_bent, curves.slope, slope), np.where(is_bent, curves.slope_sd, slope_sd)
         with_slopes = replace(kept, slope_per_degc=slope, slope_per_degc_sd=slope_sd)
-        trends = regression.judge(memory.of(with_slopes, imu), kept.kind)
+        trends = regression.judge(memory.of(with_slopes, of_unit), kept.kind)
         trends = trends if curves is None else curves.widened(trends)
     rows = _with_curves(rows, curves)
     # A flight set aside is not what the line is as of.
@@ -205,7 +205,7 @@ def _with_curves(rows: pl.DataFrame, curves: Bent | None) -> pl.DataFrame:
 
 def _sign(rows: pl.DataFrame, trends: regression.Trends) -> np.ndarray:
     """−1 (g,) where a row's sign follows its scale's and that is negative, else 1."""
-    axis = ["imu_id", "sensor", "method", "axis"]
+    axis = ["unit_id", "sensor", "method", "axis"]
     table = rows.select(*axis, "parameter", value=pl.Series(trends.value))
     scale = table.filter(pl.col("parameter") == "scale").select(*axis, sign=pl.col("value").sign())
     sign = table.join(scale, on=axis, how="left", maintain_order="left")["sign"].fill_null(1.0).to_numpy()

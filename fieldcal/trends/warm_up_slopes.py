@@ -34,7 +34,7 @@ def slopes_of_warm_ups(
             number, h.session[fitted], h.time_day[fitted], h.temperature_degc[fitted], h.value[fitted], h.sd[fitted]
         )
     )
-    key = ["imu_id", "sensor", "axis"]
+    key = ["unit_id", "sensor", "axis"]
     found = rows[series].select(key).with_columns(warm=pl.Series(mean), warm_sd=pl.Series(sd))
     table = rows.with_columns(value=pl.Series(trends.value))
     scale = table.filter(pl.col("parameter") == "scale").select(*key, "method", factor=-pl.col("value"))

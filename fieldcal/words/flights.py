@@ -41,8 +41,10 @@ def is_consequence(run: Refusable) -> bool:
 
     The same code is a cause where a stage finds it in the log itself: equation error's `no_gyroscope`."""
     from fieldcal.stages.pipeline import PIPELINE
+    from fieldcal.stages.stage import stage_and_unit
 
-    code, stage = str(run["reason_code"]), next((s for s in PIPELINE if s.name == run["stage"]), None)
+    name, _ = stage_and_unit(run["stage"])
+    code, stage = str(run["reason_code"]), next((s for s in PIPELINE if s.name == name), None)
     needs = () if stage is None else (need for need in stage.needs if not stage.reads[need].startswith("ingest."))
     wanting = code in (ReasonCode.NO_SAMPLES, ReasonCode.NO_MANOEUVRE) or code in [f"no_{need}" for need in needs]
     return bool(run["status"] == Status.REFUSED and wanting)

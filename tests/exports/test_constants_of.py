@@ -137,3 +137,30 @@ def test_an_unknown_vehicle_is_told_the_known_ones(tmp_path: Path, vehicles: int
     with pytest.raises(FieldcalError, match="No calibration of vehicle 'other'") as caught:
         constants_of(root, "other")
     assert f"there is: {', '.join(names[:20])}." in str(caught.value)
+
+
+def test_a_unit_that_was_swapped_does_not_lend_its_constants(tmp_path: Path) -> None:
+    """The sensor that flies now was refused: what is known is of the one that was taken out."""
+    old = lead("v", "f1", 0) | {"unit_id": "old"}
+    new = lead("v", "f2", 1) | {"unit_id": "new"}
+    refused = [{**row, "status": "refused", "reason_code": "too_little_motion"} for row in flight(new, 3.0)]
+    accelerometer = [{**row, "sensor": "accelerometer"} for row in flight(new, 1.0)]
+    root = warehouse(tmp_path, flight(old), [*refused, *accelerometer])
+    found = constants_of(root, "v")
+    assert (set(found.triads), found.unit_ids) == ({"accelerometer"}, {"accelerometer": "new"})
+    assert constants_of(root, "v", unit_id="old").triads[Sensor.GYROSCOPE].scale[0, 0] == 2.0
+
+
+def test_the_primary_unit_counts_whichever_flew_beside_it(tmp_path: Path) -> None:
+    """In the second flight the vehicle flew with the unit that was a further one before."""
+    both = [
+        [
+            *flight(lead("v", f"f{day}", day) | {"unit_id": "one", "is_primary": day == 0}, 2.0),
+            *flight(lead("v", f"f{day}", day) | {"unit_id": "two", "is_primary": day == 1}, 3.0),
+        ]
+        for day in (0, 1)
+    ]
+    assert constants_of(warehouse(tmp_path / "a", both[0]), "v").unit_ids == {"gyroscope": "one"}
+    found = constants_of(warehouse(tmp_path / "b", *both), "v")
+    assert found.unit_ids == {"gyroscope": "two"}
+    assert found.triads[Sensor.GYROSCOPE].scale[0, 0] == 3.0

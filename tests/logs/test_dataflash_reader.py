@@ -432,11 +432,13 @@ def test_a_log_in_memory_holds_the_further_units_too(tmp_path: Path, flight: Dat
     assert frames["imu.1"]["gyroscope_x"].to_list() == flight.gyroscope_1[:, 0].tolist()
 
 
-def test_a_tidy_flight_holds_the_primary_units(tmp_path: Path, flight: DataflashFlight) -> None:
+def test_a_tidy_flight_holds_the_further_units_too(tmp_path: Path, flight: DataflashFlight) -> None:
     frames, facts = read_flight(flight.write(tmp_path / "a.bin"), vehicle())
     assert facts["verdict"] == "ok"
     assert facts["started_at_ns"] == UTC_AT_BOOT_NS + int(flight.t_us[0]) * 1000
-    assert set(frames) == {"imu", "temperature", "magnetometer", "position", "gnss_velocity", "vps", "power"}
+    of_the_vehicle = {"magnetometer", "position", "gnss_velocity", "vps", "power"}
+    assert set(frames) == {"imu", "temperature", "imu.1", "temperature.1", *of_the_vehicle}
+    assert [unit["table"] for unit in facts["units_on_board"]] == ["imu", "imu.1"]
 
 
 def test_the_writer_refuses_what_does_not_fit(tmp_path: Path) -> None:

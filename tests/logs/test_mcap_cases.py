@@ -81,3 +81,11 @@ def test_one_of_two_imus_is_chosen(tmp_path: Path, frame: str, factor: float) ->
     (tmp_path / "fieldcal.toml").write_text(text)
     document = fieldcal.calibrate(folder / "log.mcap", method="serial", config=tmp_path / "fieldcal.toml").document
     assert scales(document) == pytest.approx([factor * scale for scale in (1.02, 0.985, 1.01)], rel=0.025)
+    other = fieldcal.calibrate(
+        folder / "log.mcap", method="serial", config=tmp_path / "fieldcal.toml", unit="imu.1"
+    ).document
+    (unit_id,) = {row["unit_id"] for row in other["calibration"]}
+    left_out = {"imu_left": "imu_right", "imu_right": "imu_left"}[frame]
+    assert unit_id.endswith(f":{left_out}")
+    others_factor = {1.0: 1 / 1.05, 1 / 1.05: 1.0}[factor]
+    assert scales(other) == pytest.approx([others_factor * scale for scale in (1.02, 0.985, 1.01)], rel=0.025)

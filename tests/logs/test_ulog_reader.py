@@ -217,7 +217,7 @@ def test_further_units_have_tables_of_their_own(tmp_path: Path) -> None:
     assert codes(summary) == ["already_corrected", "further_units"]
     path = tmp_path / "f.ulg"
     frames, facts = ingest.read_flight(path, parse("", None).vehicle("v"))
-    assert set(frames) == {"imu"}
+    assert set(frames) == {"imu", "imu.1"}
     assert facts["verdict"] == "ok"
 
 

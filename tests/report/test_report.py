@@ -18,13 +18,14 @@ from history_rows import lead, rows
 from report_rows import publish_fleet
 
 from fieldcal.batch.jobs import find_jobs
-from fieldcal.batch.steps import FlightWork
+from fieldcal.batch.steps import STEPS, FlightWork
 from fieldcal.cli.main import run
 from fieldcal.config.find import configuration_of, find_source
 from fieldcal.errors import FieldcalError
 from fieldcal.flight.calibrate import identify, read, run_stages
 from fieldcal.flight.rows import flight_row, published_tables, rows_frame, run_rows
 from fieldcal.flight.rows import lead as lead_of
+from fieldcal.flight.units import units_of
 from fieldcal.report import (
     log_report,
     write_fleet_report,
@@ -119,7 +120,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for job in find_jobs(archive, configuration):
         vehicle = configuration.vehicle(job.vehicle_id)
         work = FlightWork(root, job, vehicle)
-        for step in work.steps():
+        for step in STEPS:
             work.run(step)
         facts = work.records["ingest"]["facts"]
         leading = lead_of(job, vehicle.imu_id, facts)
@@ -129,9 +130,10 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for key in (work.records[stage]["run_key"],)
             if name in work.records[stage]["outputs"]
         }
-        history = published_tables([(leading, tables)])
+        units = units_of(facts, vehicle)
+        history = published_tables([(leading, units[0], tables)])
         history["flight"] = rows_frame("flight", [flight_row(job, leading, facts)])
-        history["run"] = rows_frame("run", run_rows(leading, work.records))
+        history["run"] = rows_frame("run", run_rows(leading, units, work.records))
         publish(root, job.vehicle_id, history, [job.flight_id])
     return root
 

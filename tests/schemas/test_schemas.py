@@ -122,7 +122,7 @@ def test_check_tells_what_an_older_file_lacks_and_a_row_can_do_without() -> None
     assert schemas.check(drift, "drift") == schemas.check(older, "drift") == ()
     lacking = older.remove(older.get_field_index("borrowed_from")).append(pa.field("former", pa.int8()))
     assert schemas.check(lacking, "drift") == ("borrowed_from",)
-    with pytest.raises(schemas.SchemaMismatch, match=r"missing n_flights.*version 2, this release knows version 3"):
+    with pytest.raises(schemas.SchemaMismatch, match=r"missing n_flights.*version 2, this release knows version 4"):
         schemas.check(lacking.remove(lacking.get_field_index("n_flights")), "drift")
     segments = schemas.arrow_schema("segments").with_metadata({"fieldcal.schema_version": "0"})
     with pytest.raises(schemas.SchemaMismatch, match="missing reason"):
@@ -146,11 +146,11 @@ FORMS = {
     "covariance": (1, "95bf049d"),
     "vps_aligned": (1, "8f8b1e84"),
     "flight": (1, "e2a4d5fc"),
-    "calibration": (1, "44f85a5f"),
-    "fit": (1, "1da89ccb"),
-    "sync": (1, "5d5d4459"),
-    "run": (1, "4c6f4dd1"),
-    "drift": (3, "20966f86"),
+    "calibration": (2, "a07f34b9"),
+    "fit": (2, "584e4810"),
+    "sync": (2, "620282fd"),
+    "run": (2, "27debd78"),
+    "drift": (4, "e8fac4a1"),
 }
 """Version of every table and digest of its columns: only by its version is an older file known for one."""
 

@@ -39,6 +39,7 @@ def settings(matrix: np.ndarray, offset: np.ndarray, *, known: bool = True) -> C
         applied_known={**own, Sensor.GYROSCOPE: known},
         applied_matrix_sd={**own, Sensor.GYROSCOPE: 0.0},
         applied_offset_sd={**own, Sensor.GYROSCOPE: (0.0, 0.0, 0.0)},
+        own_sensors=SENSORS,
     )
 
 

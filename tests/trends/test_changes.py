@@ -20,7 +20,13 @@ from fieldcal.warehouse.layout import history_files
 
 NOW = START + dt.timedelta(days=100)
 NOBODY = pl.DataFrame(
-    schema={"vehicle_id": pl.String, "imu_id": pl.String, "sensor": pl.String, "last_at": pl.Datetime("us", "UTC")}
+    schema={
+        "vehicle_id": pl.String,
+        "imu_id": pl.String,
+        "unit_id": pl.String,
+        "sensor": pl.String,
+        "last_at": pl.Datetime("us", "UTC"),
+    }
 )
 
 

@@ -52,6 +52,20 @@ def test_columns_that_a_file_is_older_than_are_null(
     assert verify(root)["ok"]
 
 
+@pytest.mark.parametrize("read", READ.values(), ids=READ)
+@pytest.mark.parametrize("table", ["calibration", "run"])
+def test_rows_from_before_units_were_told_apart_are_of_the_primary_one(
+    root: Path, table: str, read: Callable[[Path, str], pl.DataFrame]
+) -> None:
+    """Their unit is the vehicle's IMU, as it is today where a log tells of one alone."""
+    before = read(root, table)
+    age(root, history_path(root, table, "a"), table, ["unit_id", "is_primary"])
+    assert before["unit_id"].to_list() == before["imu_id"].to_list()
+    polars.testing.assert_frame_equal(read(root, table), before)
+    publish(root, "a", flight("a", "a2", 1), ["a2"])
+    assert read_history(root, table, "a")["unit_id"].null_count() == 0
+
+
 def test_files_of_both_forms_are_asked_as_one_table(root: Path) -> None:
     age(root, history_path(root, "flight", "a"), "flight", ["verifiable"])
     rows = [("a1", None), ("b1", True)]

@@ -2,7 +2,7 @@
 -- scatters about it by session_sd. A bend over temperature (curve_per_degc2, _degc3) is in the value, its sd is not.
 CREATE MACRO calibration_at(temperature_degc) AS TABLE
 SELECT
-    l.vehicle_id, l.imu_id, l.sensor, l.method, l.parameter, l.axis,
+    l.vehicle_id, l.imu_id, l.unit_id, l.is_primary, l.sensor, l.method, l.parameter, l.axis,
     l.value_at_25degc + coalesce(l.slope_per_degc, 0) * (temperature_degc - {reference_degc})
     + coalesce(l.curve_per_degc2, 0) * (temperature_degc - {reference_degc}) ^ 2
     + coalesce(l.curve_per_degc3, 0) * (temperature_degc - {reference_degc}) ^ 3 AS value,
@@ -30,4 +30,4 @@ SELECT
         END
     ) AS why
 FROM latest_calibration AS l
-ORDER BY l.imu_id, l.sensor, l.parameter, l.axis;
+ORDER BY l.unit_id, l.sensor, l.parameter, l.axis;

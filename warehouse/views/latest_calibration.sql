@@ -1,4 +1,4 @@
--- One row an IMU, sensor, parameter and axis: the value at the reference temperature, its sd and its slope, where they
+-- One row a unit, sensor, parameter and axis: the value at the reference temperature, its sd and its slope, where they
 -- come from (source) and why. source = 'drift': the unit's trend as of its last flight, which draws a noisy single
 -- flight towards the history by its sd; with two to four sessions the siblings lend the scatter and the slope.
 -- source = 'flight': the latest value that was not refused, where there is no trend yet, or where it lies more than
@@ -9,9 +9,12 @@
 CREATE VIEW latest_calibration AS
 WITH latest AS (
     SELECT
-        imu_id, sensor, parameter, axis,
+        unit_id, sensor, parameter, axis,
         arg_max(
-            struct_pack(vehicle_id, method, value, sd, unit, at_degc := c.temperature_degc, flight_id, started_at),
+            struct_pack(
+                vehicle_id, imu_id, is_primary, method, value, sd, unit, at_degc := c.temperature_degc, flight_id,
+                started_at
+            ),
             row(
                 coalesce(started_at, TIMESTAMPTZ '-infinity'), flight_id,
                 CASE method {exactness} ELSE 0 END,
@@ -20,11 +23,11 @@ WITH latest AS (
         ) AS l
     FROM calibration AS c
     WHERE status = 'ok' AND value IS NOT NULL
-    GROUP BY imu_id, sensor, parameter, axis
+    GROUP BY unit_id, sensor, parameter, axis
 ),
 beside AS (
     SELECT
-        k.imu_id, k.sensor, k.parameter, k.axis, l, d,
+        k.unit_id, k.sensor, k.parameter, k.axis, l, d,
         d.value_at_25degc IS NOT NULL AND (d.status <> 'insufficient' OR d.borrowed_from IS NOT NULL) AS trend,
         coalesce(
             d.slope_per_degc * (l.at_degc - {reference_degc})
@@ -36,7 +39,7 @@ beside AS (
         coalesce(d.best_known_degc, {reference_degc}) AS best
     FROM latest AS k
     LEFT JOIN drift AS d
-        ON d.imu_id = k.imu_id AND d.sensor = k.sensor AND d.method = l.method AND d.parameter = k.parameter
+        ON d.unit_id = k.unit_id AND d.sensor = k.sensor AND d.method = l.method AND d.parameter = k.parameter
         AND d.axis = k.axis AND d.unit IS NOT DISTINCT FROM l.unit
 ),
 judged AS (
@@ -63,7 +66,7 @@ chosen AS (
     SELECT *, trend AND NOT off > {unconfirmed_sd} AS by_trend, trend AND off > {unconfirmed_sd} AS beyond FROM judged
 )
 SELECT
-    l.vehicle_id, imu_id, sensor, l.method, parameter, axis,
+    l.vehicle_id, l.imu_id, unit_id, l.is_primary, sensor, l.method, parameter, axis,
     CASE WHEN by_trend THEN d.value_at_25degc WHEN beyond THEN l.value - warmer ELSE l.value END AS value_at_25degc,
     CASE
         WHEN by_trend THEN d.sd
@@ -107,4 +110,4 @@ SELECT
         ELSE 'The latest flight as it is: no trend was made yet.'
     END AS why
 FROM chosen
-ORDER BY imu_id, sensor, parameter, axis;
+ORDER BY unit_id, sensor, parameter, axis;

@@ -2,8 +2,8 @@
 CREATE VIEW worst_tic AS
 SELECT
     t.tic, t.rms, t.rms_unit, t.quantity, t.method, t.reference, t.signal, t.sample, t.n_samples,
-    t.vehicle_id, t.imu_id, t.session_id, t.flight_id, t.started_at, f.log_uri, f.verdict
+    t.vehicle_id, t.imu_id, t.unit_id, t.session_id, t.flight_id, t.started_at, f.log_uri, f.verdict
 FROM fit AS t
 LEFT JOIN flight AS f USING (vehicle_id, flight_id)
 WHERE t.tic IS NOT NULL
-ORDER BY t.tic DESC, t.flight_id, t.quantity, t.method, t.reference;
+ORDER BY t.tic DESC, t.flight_id, t.unit_id, t.quantity, t.method, t.reference;

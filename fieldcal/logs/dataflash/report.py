@@ -96,6 +96,7 @@ def describe(file: DataflashFile, epoch: Epoch | None, summary: LogSummary) -> l
         elif board:
             summary.metadata.setdefault("hardware", board["board"])
             summary.metadata.setdefault("board_id", board["id"])
+            summary.board_id = summary.metadata["board_id"]
         elif OPERATING_SYSTEM.match(text):
             summary.metadata.setdefault("operating_system", text)
     versions = file.rows("VER")

@@ -1,4 +1,5 @@
-"""Several IMUs on one topic, their messages' frame_id telling them apart: one is chosen, or the file is refused."""
+"""Several IMUs on one topic, their messages' frame_id telling them apart: one is chosen as the primary one, or the
+file is refused."""
 
 from __future__ import annotations
 
@@ -20,34 +21,38 @@ INTERLEAVED_SHARE = 0.2
 """Where the frame changes from message to message so often, two IMUs publish; a frame that is renamed changes once."""
 
 
-def of_frame(
+def by_frame(
     data: NDArray[np.uint8],
     starts: NDArray[np.int64],
     sizes: NDArray[np.int64],
     frame_id: str | None,
     source: Source,
     log_name: str,
-) -> NDArray[np.bool_]:
-    """Which messages, whose payloads begin at byte `starts` of `data` and are `sizes` long, are of the chosen IMU.
+) -> dict[str, NDArray[np.bool_]]:
+    """Which messages, whose payloads begin at byte `starts` of `data` and are `sizes` long, are of which IMU.
+
+    The chosen IMU's are under "", others' under their frame_id; all are under "" where none is chosen.
 
     Raises
     ------
     UnreadableLog
         `several_units`: messages of several alternate and none is chosen.
     """
-    everything = np.ones(len(starts), dtype=bool)
+    everything = {"": np.ones(len(starts), dtype=bool)}
     if not all(isinstance(decoder, CdrDecoder) for decoder in source.decoders.values()):
         return everything
     frames = frame_ids(data, starts, sizes)
+    names = np.unique(frames[frames != b""]).tolist()
     if frame_id is not None:
-        return frames == frame_id.encode()
-    names = np.unique(frames[frames != b""])
+        others = {name.decode("utf-8", "replace"): frames == name for name in names if name != frame_id.encode()}
+        return {"": frames == frame_id.encode(), **others}
     if len(names) > 1 and np.mean(frames[1:] != frames[:-1]) > INTERLEAVED_SHARE:
-        listed = [name.decode("utf-8", "replace") for name in names.tolist()]
+        listed = [name.decode("utf-8", "replace") for name in names]
         raise UnreadableLog(
             ReasonCode.SEVERAL_UNITS,
             f"{log_name}: messages of several IMUs alternate on {source.topic}, told apart by frame_id: "
-            f"{', '.join(listed)}. Choose one: set mcap.frame_id to {' or '.join(repr(name) for name in listed)}.",
+            f"{', '.join(listed)}. Choose the primary one: set mcap.frame_id to "
+            f"{' or '.join(repr(name) for name in listed)}; the others are then calibrated as further units.",
         )
     return everything
 

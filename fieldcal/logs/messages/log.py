@@ -13,11 +13,13 @@ from fieldcal.logs.encodings.decoded import COMPONENTS, Decoded
 from fieldcal.logs.interface import Batch, Columns, LogSummary, logged_units, stamps_are_epoch
 from fieldcal.logs.joining import INERTIAL, SensorJoin, triad
 from fieldcal.logs.messages.container import Block, Container
-from fieldcal.logs.messages.frames import STAMPED_TYPES, of_frame
+from fieldcal.logs.messages.frames import STAMPED_TYPES, by_frame
 from fieldcal.logs.messages.packed import PackedPayloads
 from fieldcal.logs.messages.roles import METADATA_NAME, SI_TYPES, choose_sources
 from fieldcal.logs.messages.source import Source
 from fieldcal.logs.messages.transforms import tell_of_transforms
+from fieldcal.logs.messages.units import FurtherUnits
+from fieldcal.logs.on_board import tell_further_units
 from fieldcal.names import SENSORS
 from fieldcal.reason_codes import ReasonCode
 
@@ -64,6 +66,7 @@ class MessageLog:
         self._unstamped: dict[str, int] = {}
         self._packed = PackedPayloads()
         self._join = SensorJoin()
+        self._further = FurtherUnits()
 
     def batches(self) -> Iterator[Batch]:
         """Signal batches in file order, one per topic and chunk. May be iterated once."""
@@ -71,16 +74,16 @@ class MessageLog:
         for block in self._container.blocks(wanted):
             for source in self._sources:
                 for channel_id, decoder in source.decoders.items():
-                    some = self._chosen(source, _of_channel(block, channel_id))
-                    if not len(some.starts):
-                        continue
-                    decoded = decoder.decode(some.data, some.starts, some.sizes)
-                    lost = len(some.starts) - len(decoded.kept) if decoded.malformed is None else decoded.malformed
-                    if lost:
-                        self._malformed[source.topic] = self._malformed.get(source.topic, 0) + lost
-                    for table, columns in self._tables(source, decoded, some.log_time_ns):
-                        self.summary.count_rows(table, columns)
-                        yield table, columns
+                    for frame, some in self._by_unit(source, _of_channel(block, channel_id)):
+                        decoded = decoder.decode(some.data, some.starts, some.sizes)
+                        lost = len(some.starts) - len(decoded.kept) if decoded.malformed is None else decoded.malformed
+                        if lost:
+                            self._malformed[source.topic] = self._malformed.get(source.topic, 0) + lost
+                        for batch in self._tables(source, decoded, some.log_time_ns):
+                            placed = self._further.table(batch, source, frame)
+                            if placed is not None:
+                                self.summary.count_rows(*placed)
+                                yield placed
         joined = self._join.joined(self._name)
         if joined is not None:
             columns, finding = joined
@@ -89,14 +92,18 @@ class MessageLog:
             yield "imu", columns
         self._finish()
 
-    def _chosen(self, source: Source, block: Block) -> Block:
-        """Messages of the IMU that was chosen among several on one topic; payloads unpacked that are packed."""
+    def _by_unit(self, source: Source, block: Block) -> Iterator[tuple[str, Block]]:
+        """(frame_id, messages) of each IMU on one topic, "" of the primary or only one; payloads unpacked that are
+        packed."""
         if len(block.starts) and source.may_be_packed:
             block = self._packed.unpacked(block)
         if len(block.starts) and source.role == "imu" and source.type_name in STAMPED_TYPES:
-            frame_id = self._vehicle.mcap.frame_id
-            block = block.of(of_frame(block.data, block.starts, block.sizes, frame_id, source, self._name))
-        return block
+            frame_id = None if source.further else self._vehicle.mcap.frame_id
+            frames = by_frame(block.data, block.starts, block.sizes, frame_id, source, self._name)
+            parts = [(frame, block.of(chosen)) for frame, chosen in frames.items()]
+        else:
+            parts = [("", block)]
+        yield from ((frame, part) for frame, part in parts if len(part.starts))
 
     def _tables(self, source: Source, decoded: Decoded, log_time_ns: NDArray[np.int64]) -> Iterator[Batch]:
         t_ns = decoded.stamp_ns
@@ -115,7 +122,7 @@ class MessageLog:
             sensors = [name for name in ("gyroscope", "accelerometer") if name in values]
             if sensors:
                 yield "imu", _columns(t_ns, values, sensors)
-            others = {other.role for other in self._sources}
+            others = {other.role for other in self._sources if not (other.further or source.further)}
             if "magnetometer" in values and "magnetometer" not in others:
                 yield from _finite("magnetometer", _columns(t_ns, values, ["magnetometer"]))
             if "temperature" in values and "temperature" not in others:
@@ -155,6 +162,8 @@ class MessageLog:
 
     def _finish(self) -> None:
         self._settle_conventions()
+        self._further.tell(self.summary)
+        tell_further_units(self.summary, self._name)
         self._container.report(self.summary)
         for topic, count in self._malformed.items():
             self.summary.add(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from fieldcal.config.configuration import McapMap
 from fieldcal.config.values import Paths
@@ -116,6 +117,7 @@ def choose_sources(
             if role not in OPTIONAL:
                 raise
             summary.add(error.reason_code, 1, f"{error.sentence} The log is read without its {role}.")
+    sources += _further(mapping.further, fields, definitions, summary, log_name)
     vps = next((source.topic for source in sources if source.role == "vps"), None)
     if vps is not None and not mapping.vps and tell_of_estimate(vps, summary, log_name):
         sources = [source for source in sources if source.role != "vps"]
@@ -129,6 +131,28 @@ def choose_sources(
             f"are {_topics(definitions)}. Name them under mcap.imu and mcap.imu_fields in the configuration.",
         )
     return sources
+
+
+def _further(
+    topics: Sequence[str], fields: Mapping[str, Paths], definitions: Definitions, summary: LogSummary, log_name: str
+) -> list[Source]:
+    """The sources of further units: each topic an IMU or a magnetometer, as its message type says."""
+    found = []
+    for topic in topics:
+        channels = definitions.by_topic().get(topic)
+        type_name = type_name_of(channels[0], definitions) if channels else ""
+        role = "magnetometer" if type_name in KNOWN_TYPES["magnetometer"] else "imu"
+        try:
+            source = _configured(role, topic, fields, definitions, log_name)
+        except UnreadableLog as error:
+            summary.add(
+                error.reason_code,
+                1,
+                error.sentence.replace(f"mcap.{role}", "mcap.further") + " The log is read without this unit.",
+            )
+            continue
+        found.append(replace(source, further=True))
+    return found
 
 
 def _configured(role: str, topic: str, fields: Mapping[str, Paths], definitions: Definitions, log_name: str) -> Source:

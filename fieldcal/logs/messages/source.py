@@ -13,7 +13,8 @@ from fieldcal.logs.encodings.protobuf_messages import ProtobufDecoder
 class Source:
     """The topic that plays a role: its channels by id, message type, and which values it gives.
 
-    The role "frames" gives none: of the topic's transforms only the frames are of interest.
+    The role "frames" gives none: of the topic's transforms only the frames are of interest. `further`: it is of a unit
+    beside the primary one that plays the role.
     """
 
     role: str
@@ -21,6 +22,7 @@ class Source:
     type_name: str
     decoders: Mapping[int, Decoder]
     values: tuple[str, ...]
+    further: bool = False
 
     @property
     def may_be_packed(self) -> bool:

@@ -84,6 +84,7 @@ class UlogLog:
         self._clock = Clock(epoch.offset_ns if epoch else 0)
         self.summary.epoch_known = epoch is not None
         self.summary.metadata |= {key: text for key, text in self._file.infos.items() if len(text) <= LONGEST_INFO}
+        self.summary.board_id = self._file.infos.get("sys_uuid")
         if epoch:
             self.summary.metadata["utc_minus_boot_s"] = f"{epoch.offset_ns * 1e-9:.6f}"
             self.summary.metadata["utc_from"] = epoch.source
@@ -114,8 +115,8 @@ class UlogLog:
             warmth = aids.temperature(self._file, unit, self._clock)
             self._note_imu(unit, table, unit_id, warmth)
             yield from ((table, columns) for columns in self._imu(unit))
-            if unit.primary and warmth is not None:
-                yield "temperature", warmth
+            if warmth is not None:
+                yield table.replace("imu", "temperature"), warmth
         ids = unit_ids([unit.device_id for unit in self._magnetometers], "magnetometer", self.summary, self._name)
         for number, (unit, unit_id) in enumerate(zip(self._magnetometers, ids, strict=True)):
             table = f"magnetometer.{number}" if number else "magnetometer"
