@@ -45,6 +45,8 @@ IMUS = [pytest.param(preset, writer, id=name) for name, (preset, writer) in IMU_
 POSES = [pytest.param(preset, writer, id=name) for name, (preset, writer) in VPS_FILES.items()]
 BY_NAME = [pytest.param(preset, writer, id=name) for name, (preset, writer) in ONLY_BY_NAME.items()]
 READINGS = made()
+DAMAGES = 20
+"""Damaged files of each format; 150 each, 3,450 in all, were read without a crash once."""
 
 
 def read(
@@ -396,3 +398,46 @@ def test_an_older_topic_of_poses(tmp_path: Path) -> None:
 def test_an_unknown_preset_names_the_nearest() -> None:
     with pytest.raises(ConfigurationError, match=r'"Motiv" is not one of none, betaflight.*; did you mean "motive"\?$'):
         parse('[vehicles.a.csv]\npreset = "Motiv"', None)
+
+
+# damage --------------------------------------------------------------------------------------------------------------
+
+
+def damaged(text: str, rng: np.random.Generator) -> bytes:
+    """A file cut, with bytes flipped or lost, lines swapped, or a piece doubled; mostly near the beginning."""
+    data = bytearray(text.encode())
+    near = len(data) if rng.uniform() < 0.3 else min(len(data), 600)
+    kind = int(rng.integers(5))
+    if kind == 0:
+        return bytes(data[: int(rng.integers(1, len(data)))])
+    if kind == 1:
+        for place in rng.integers(0, near, 8).tolist():
+            data[place] = int(rng.integers(256))
+        return bytes(data)
+    if kind == 2:
+        start = int(rng.integers(near))
+        del data[start : start + int(rng.integers(1, 80))]
+        return bytes(data)
+    if kind == 3:
+        start = int(rng.integers(near))
+        return bytes(data[:start] + data[start // 2 :])
+    lines = bytes(data).split(b"\n")
+    a, b = rng.integers(0, min(len(lines), 14), 2).tolist()
+    lines[a], lines[b] = lines[b], lines[a]
+    return b"\n".join(lines)
+
+
+@pytest.mark.parametrize("name", [*IMU_FILES, *VPS_FILES, *ONLY_BY_NAME])
+def test_damage_is_no_crash(tmp_path: Path, name: str) -> None:
+    """Recognised or forced: a verdict, and a sentence where nothing is read."""
+    preset, writer = {**IMU_FILES, **VPS_FILES, **ONLY_BY_NAME}[name]
+    rng = np.random.default_rng(7)
+    text = writer(READINGS)
+    log = tmp_path / "log.csv" if name in IMU_FILES else tmp_path
+    own_imu = {of: own(READINGS) for of, own in IMU_FILES.values()}.get(preset, DEFAULT_IMU)
+    (tmp_path / "imu.csv").write_text(own_imu)
+    for number in range(DAMAGES):
+        (log if name in IMU_FILES else tmp_path / "vps.csv").write_bytes(damaged(text, rng))
+        tables, facts = read_flight(log, vehicle(csv=CsvMap(preset=preset if number % 2 else None)))
+        assert tables or facts["reason"]
+        assert "imu" in tables or name in IMU_FILES

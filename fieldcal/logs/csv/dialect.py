@@ -124,8 +124,9 @@ def header_place(texts: list[str], separator: str | None, decimal: str | None) -
     does not fit what follows it, and only taken where a line of names with as many cells as the rows is found.
     """
     for title, header in HEADERS_BELOW:
-        if texts[0].startswith(title):
-            return next((place for place, line in enumerate(texts) if line.startswith(header)), 0)
+        below = [place for place, line in enumerate(texts) if line.startswith(header)]
+        if texts[0].startswith(title) and below:
+            return below[0]
     data = texts[1:_LINES_LOOKED_AT]
     first = separator or _separator(texts[0], data)
     fields = len(cells_of(texts[0], first))

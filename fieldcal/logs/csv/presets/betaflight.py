@@ -6,8 +6,8 @@ import math
 import re
 import struct
 
-from fieldcal.logs.csv.dialect import cells_of, is_number
-from fieldcal.logs.csv.presets.layout import Layout, Meaning, Preset
+from fieldcal.logs.csv.dialect import cells_of
+from fieldcal.logs.csv.presets.layout import Layout, Meaning, Preset, positive
 
 GYROSCOPE, ACCELEROMETER, MAGNETOMETER = "gyroADC[*]", "accSmooth[*]", "magADC[*]"
 EXPLORER = "Blackbox flight data recorder"
@@ -53,15 +53,16 @@ def _scales(layout: Layout) -> tuple[dict[str, float], dict[str, str]]:
     gyroScale is rad/µs a count, and gyro_scale, the same as logged, deg/s as a float in hexadecimal."""
     header = {cells[0]: cells[1] for cells in (cells_of(line, ",") for line in layout.above) if len(cells) > 1}
     factors, units = {}, {}
-    one_g, scale, logged = (header.get(key, "") for key in ("acc_1G", "gyroScale", "gyro_scale"))
-    if is_number(one_g) and float(one_g) > 0:
-        factors["accelerometer"], units["accelerometer"] = 1.0 / float(one_g), "g"
+    one_g, scale = (positive(header.get(key, "")) for key in ("acc_1G", "gyroScale"))
+    logged = header.get("gyro_scale", "")
+    if one_g is not None:
+        factors["accelerometer"], units["accelerometer"] = 1.0 / one_g, "g"
     dps = None
-    if is_number(scale) and float(scale) > 0:
-        dps = math.degrees(float(scale) * 1e6)
+    if scale is not None:
+        dps = math.degrees(scale * 1e6)
     elif _HEX_FLOAT.match(logged):
-        dps = struct.unpack(">f", bytes.fromhex(logged[2:]))[0]
-    if dps is not None and math.isfinite(dps) and dps > 0:
+        dps = positive(repr(struct.unpack(">f", bytes.fromhex(logged[2:]))[0]))
+    if dps is not None:
         fine = header.get("blackbox_high_resolution", "0") not in ("0", "")
         factors["gyroscope"], units["gyroscope"] = dps / (HIGH_RESOLUTION if fine else 1.0), "deg/s"
     return factors, units

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from fieldcal.config.values import Paths
-from fieldcal.logs.csv.dialect import Dialect, cells_of, line_text
+from fieldcal.logs.csv.dialect import Dialect, cells_of, is_number, line_text
 from fieldcal.names import Body, CsvPreset, GravitySign, World
 
 XYZ = ("x", "y", "z")
@@ -97,3 +98,9 @@ class Preset:
 def axes(pattern: str, over: tuple[str, ...] = XYZ) -> tuple[str, ...]:
     """Names of columns, one for each of `over` in the place of `*`."""
     return tuple(pattern.replace("*", axis) for axis in over)
+
+
+def positive(text: str) -> float | None:
+    """A finite number above zero, as a rate or a scale must be; None for any other text."""
+    value = float(text) if is_number(text) else math.nan
+    return value if 0.0 < value < math.inf else None

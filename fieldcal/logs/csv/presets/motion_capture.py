@@ -10,8 +10,8 @@ import math
 import re
 
 from fieldcal.config.values import Paths
-from fieldcal.logs.csv.dialect import cells_of, is_number
-from fieldcal.logs.csv.presets.layout import Layout, Meaning, Preset, axes
+from fieldcal.logs.csv.dialect import cells_of
+from fieldcal.logs.csv.presets.layout import Layout, Meaning, Preset, axes, positive
 
 UPPER, UPPER_XYZW = ("X", "Y", "Z"), ("X", "Y", "Z", "W")
 METRES = {"meters": 1.0, "centimeters": 1e-2, "millimeters": 1e-3}
@@ -41,7 +41,7 @@ def _read_motive(layout: Layout, *, y_up: bool) -> Meaning | str:
         return f"its Length Units are {told['Length Units']}"
     if told.get("Coordinate Space", "Global") != "Global":
         return f"its Coordinate Space is {told['Coordinate Space']}; export global poses"
-    if layout.names[0] != "Frame" or not layout.names[1].startswith("Time"):
+    if len(layout.names) < 2 or layout.names[0] != "Frame" or not layout.names[1].startswith("Time"):
         return "its columns do not begin with Frame, Time (Seconds)"
     rows = [cells_of(line, layout.separator) for line in layout.above[1:]]
     kinds = next((row for row in rows if "Rigid Body" in row), None)
@@ -87,8 +87,8 @@ MOTIVE_Z_UP = Preset("motive_z_up", "OptiTrack Motive's", "vps", lambda layout: 
 def _read_vicon(layout: Layout) -> Meaning | str:
     if layout.names[:2] != ("Frame", "Sub Frame") or len(layout.above) < 2:
         return "its columns do not begin with Frame, Sub Frame below a line with the bodies' names"
-    rates = [float(line.strip(",;\t ")) for line in layout.above if is_number(line.strip(",;\t "))]
-    if not rates or not rates[0]:
+    rates = [rate for rate in (positive(line.strip(",;\t ")) for line in layout.above) if rate is not None]
+    if not rates:
         return "no line above its header gives the frame rate"
     owners = layout.above_cells(1)
     names, bodies, owner = list(layout.names), [], ""
@@ -135,7 +135,7 @@ _BODY_X = re.compile(r"(?:(.*) )?X$")
 
 
 def _read_qualisys(layout: Layout) -> Meaning | str:
-    header = {cells[0]: cells[1:] for cells in (line.split("\t") for line in layout.above)}
+    header = {cells[0]: cells[1:] for cells in (line.split("\t") for line in layout.above) if len(cells) > 1}
     if header.get("DATA_INCLUDED", [""])[0].strip() != "6D":
         return "no line 'DATA_INCLUDED 6D' stands above its header"
     names, bodies = list(layout.names), []
@@ -153,10 +153,9 @@ def _read_qualisys(layout: Layout) -> Meaning | str:
     if layout.has("Time"):
         vps["t"] = "Time"
     else:
-        rate = header.get("FREQUENCY", [""])[0].strip()
-        if not is_number(rate) or not float(rate):
+        rate_hz = positive(header.get("FREQUENCY", [""])[0])
+        if rate_hz is None:
             return "it has neither a column Time nor a FREQUENCY in Hz above the header"
-        rate_hz = float(rate)
         if layout.has("Frame"):
             vps["t"] = "Frame"
     vps["rotation_matrix"] = tuple(f"{bodies[0]} {name}" for name in _ROTATIONS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from fieldcal.logs.csv.presets.layout import Layout, Meaning, Preset, axes
+from fieldcal.logs.csv.presets.layout import Layout, Meaning, Preset, axes, positive
 
 TICK = "100us"
 """SampleTimeFine counts 10 kHz (MT low-level communication protocol), in 32 bits."""
@@ -26,8 +26,8 @@ def read(layout: Layout) -> Meaning | str:
     units = {"gyroscope": "rad/s", "accelerometer": "m/s^2", "magnetometer": "norm"}
     if layout.has("SampleTimeFine") and layout.cell("SampleTimeFine").isdigit():
         return Meaning(imu={"t": "SampleTimeFine", **known}, time_unit=TICK, units=units, gravity_sign="specific_force")
-    rates = [float(match[1]) for match in map(_RATE.match, layout.above) if match]
-    if not layout.has("PacketCounter") or not rates or not rates[0]:
+    rates = [positive(match[1]) for match in map(_RATE.match, layout.above) if match]
+    if not layout.has("PacketCounter") or not rates or rates[0] is None:
         return "it has neither SampleTimeFine nor a PacketCounter with an update rate above the header"
     return Meaning(
         imu={"t": "PacketCounter", **known},
