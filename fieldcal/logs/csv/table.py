@@ -44,9 +44,19 @@ class CsvTable:
         Which of "imu" and "vps" to look for in it.
     summary : LogSummary
         Receives findings and counts.
+    join : SensorJoin, optional
+        Takes the readings of gyroscope and accelerometer, where they stand in files of their own.
     """
 
-    def __init__(self, path: Path, name: str, vehicle: Vehicle, tables: tuple[str, ...], summary: LogSummary) -> None:
+    def __init__(
+        self,
+        path: Path,
+        name: str,
+        vehicle: Vehicle,
+        tables: tuple[str, ...],
+        summary: LogSummary,
+        join: SensorJoin | None = None,
+    ) -> None:
         self._name = name
         self._summary = summary
         self._csv = vehicle.csv
@@ -85,7 +95,8 @@ class CsvTable:
                 "above it were passed over.",
             )
         self._instance_place = self._instances(first)
-        self._join = SensorJoin() if self._sensors_stand_apart(first) else None
+        self._joins_itself = join is None
+        self._join = SensorJoin() if join is None and self._sensors_stand_apart(first) else join
 
     def batches(self) -> Iterator[Batch]:
         """Signal batches, block by block."""
@@ -292,7 +303,7 @@ class CsvTable:
 
     def _joined(self) -> Iterator[Batch]:
         """Rows of sensors that stand in rows of their own."""
-        found = self._join.joined(self._name) if self._join is not None else None
+        found = self._join.joined(self._name) if self._join is not None and self._joins_itself else None
         if found is not None:
             batch, finding = found
             self._summary.findings.append(finding)

@@ -11,6 +11,7 @@ from fieldcal.logs.csv.presets.layout import XYZ, Layout, Meaning, Preset, axes
 INDICES = ("0", "1", "2")
 WXYZ = ("w", "x", "y", "z")
 XYZW = ("x", "y", "z", "w")
+UPPER = ("X", "Y", "Z")
 
 
 @dataclass(frozen=True)
@@ -113,8 +114,8 @@ MAVLOGDUMP = Preset(
         Meaning(
             imu={
                 "t": "TimeUS",
-                "gyroscope": axes("Gyr*", ("X", "Y", "Z")),
-                "accelerometer": axes("Acc*", ("X", "Y", "Z")),
+                "gyroscope": axes("Gyr*", UPPER),
+                "accelerometer": axes("Acc*", UPPER),
             },
             time_unit="us",
             units={**SI, "magnetometer": "mgauss"},
@@ -123,7 +124,7 @@ MAVLOGDUMP = Preset(
             told="ArduPilot had corrected the readings by its own calibration; the .bin tells how",
         ),
         beside=("timestamp",),
-        optional={"temperature": "T", "magnetometer": axes("Mag*", ("X", "Y", "Z"))},
+        optional={"temperature": "T", "magnetometer": axes("Mag*", UPPER)},
     ).read,
 )
 """Message IMU: `TimeUS` is µs since boot and exact, `timestamp` a date rounded in floating point. Several IMUs stand in
@@ -189,28 +190,35 @@ PHYPHOX = Preset("phyphox", "phyphox'", "imu", _read_phyphox)
 "Linear Acceleration", without it, is not read. Axes are the phone's and left to the configuration."""
 
 _X_IO = {
-    "gyroscope": axes("Gyroscope * (deg/s)", ("X", "Y", "Z")),
-    "accelerometer": axes("Accelerometer * (g)", ("X", "Y", "Z")),
+    "gyroscope": axes("Gyroscope * (deg/s)", UPPER),
+    "accelerometer": axes("Accelerometer * (g)", UPPER),
 }
+_X_IMU3_UNITS = {"magnetometer": "counts"}
 _X_IO_UNITS = {"gyroscope": "deg/s", "accelerometer": "g", "magnetometer": "uT"}
+_X_IMU3 = Meaning(
+    imu={"t": "Timestamp (us)", **_X_IO}, time_unit="us", units=_X_IO_UNITS, gravity_sign="specific_force"
+)
 X_IO = Preset(
     "x_io",
     "x-io Technologies'",
     "imu",
     first_of(
-        Columns(
-            Meaning(
-                imu={"t": "Timestamp (us)", **_X_IO}, time_unit="us", units=_X_IO_UNITS, gravity_sign="specific_force"
+        Columns(_X_IMU3),
+        *(
+            Columns(
+                replace(_X_IMU3, imu={"t": "Timestamp (us)", "magnetometer": axes(pattern, UPPER)}, units=_X_IMU3_UNITS)
             )
+            for pattern in ("* (a.u.)", "* Axis (a.u.)")
         ),
+        Columns(replace(_X_IMU3, imu={"t": "Timestamp (us)", "temperature": "Temperature (degC)"})),
         Columns(
-            Meaning(imu={"t": "Time (s)", **_X_IO}, time_unit="s", units=_X_IO_UNITS, gravity_sign="specific_force"),
-            optional={"magnetometer": axes("Magnetometer * (uT)", ("X", "Y", "Z"))},
+            replace(_X_IMU3, imu={"t": "Time (s)", **_X_IO}, time_unit="s"),
+            optional={"magnetometer": axes("Magnetometer * (uT)", UPPER)},
         ),
     ),
 )
-"""x-IMU3's Inertial.csv and NGIMU's sensors.csv. The x-IMU3's magnetometer is in a file of its own and not read. Axes
-are those printed on the device and left to the configuration."""
+"""x-IMU3's Inertial.csv, Magnetometer.csv (of arbitrary unit) and Temperature.csv; NGIMU's sensors.csv. Axes are those
+printed on the device and left to the configuration."""
 
 
 def _ros_pose(stamp: str, position: str, orientation: str) -> Meaning:
