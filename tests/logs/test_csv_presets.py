@@ -348,6 +348,18 @@ def test_configured_units_world_and_time_go_first(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.diff(frames["imu"]["t_ns"].to_numpy()), 20_000_000)
 
 
+def test_the_rate_of_the_imus_packets_is_not_that_of_a_vps(tmp_path: Path) -> None:
+    """Unless the configuration names the VPS's time, too."""
+    imu = IMU_FILES["xsens_packets"][1](READINGS)
+    frames, facts = read(tmp_path, imu, vicon(READINGS), CsvMap(rate_hz=50.0))
+    np.testing.assert_array_equal(np.diff(frames["imu"]["t_ns"].to_numpy()), 20_000_000)
+    np.testing.assert_array_equal(np.diff(frames["vps"]["t_ns"].to_numpy()), 10_000_000)
+    csv = CsvMap(rate_hz=50.0, preset="vicon_nexus", vps={"t": "Frame"})
+    frames, facts = read(tmp_path, imu, vicon(READINGS), csv)
+    np.testing.assert_array_equal(np.diff(frames["vps"]["t_ns"].to_numpy()), 20_000_000)
+    assert len([finding for finding in facts["findings"] if finding["code"] == "preset"]) == 2
+
+
 def test_no_preset(tmp_path: Path) -> None:
     _, facts = read(tmp_path, IMU_FILES["euroc"][1](READINGS), csv=CsvMap(preset="none"))
     assert facts["reason_code"] == "missing_sensor"

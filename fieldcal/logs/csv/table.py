@@ -68,7 +68,7 @@ class CsvTable:
         self._as = read_as(self._csv, layout, tables, columns_of.known_by_names(self.dialect, self._csv), name)
         if self._as.meaning.names:
             self.dialect = replace(self.dialect, names=self._as.meaning.names)
-        self._rate_hz = self._csv.rate_hz or self._as.meaning.rate_hz
+        self._rate_hz = self._as.rate_hz(self._csv)
         self._only_by_name = only_by_name(layout) if self._as.preset is None and self._csv.preset is None else ""
         self._clocks: dict[int, FileClock] = {}
         self._to_rad = 1.0

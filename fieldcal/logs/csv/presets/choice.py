@@ -70,6 +70,13 @@ class ReadAs:
         """Unit of a table's time, where its column is the preset's."""
         return self.meaning.time_unit if table in self.tables and "t" not in configured else None
 
+    def rate_hz(self, csv: CsvMap) -> float | None:
+        """Rate of the file's rows or numbers. What a VPS's file says of itself goes before `csv.rate_hz`, which is the
+        IMU's, unless the configuration names its time."""
+        if self.tables == {"vps"} and self.meaning.rate_hz and "t" not in csv.vps:
+            return self.meaning.rate_hz
+        return csv.rate_hz or self.meaning.rate_hz
+
     def tell(self, summary: LogSummary, log_name: str) -> None:
         """Record the preset, and the conventions that it fixes for the tables that were read by it."""
         if self.preset is None:
