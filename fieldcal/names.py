@@ -153,6 +153,22 @@ Equations = Literal["all", "scalar"]
 InitialAttitude = Literal["estimated", "fixed"]
 SegmentEnds = Literal["odd", "even"]
 ProfileName = Literal["full", "onboard", "paper"]
+CsvPreset = Literal[
+    "betaflight",
+    "euroc",
+    "mavlogdump",
+    "motive",
+    "motive_z_up",
+    "phyphox",
+    "plotjuggler",
+    "qualisys",
+    "rostopic",
+    "ulog2csv",
+    "vicon_nexus",
+    "x_io",
+    "xsens_mt",
+]
+"""CSV formats that are known by name (`fieldcal.logs.csv.presets`)."""
 
 
 FIELD_ASSUMED = "assumed"

@@ -37,7 +37,7 @@ from fieldcal.config.values import (
     wrong,
 )
 from fieldcal.errors import ConfigurationError
-from fieldcal.names import SENSORS, Approach, Body, FieldUnit, GravitySign, Json, ProfileName, World
+from fieldcal.names import SENSORS, Approach, Body, CsvPreset, FieldUnit, GravitySign, Json, ProfileName, World
 from fieldcal.reason_codes import ReasonCode
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -85,6 +85,9 @@ class LocalField(Table):
 class CsvMap(Table):
     """Where a vehicle's CSV logs differ from the default columns. `imu` and `vps` hold configured names only."""
 
+    preset: Annotated[
+        Literal["none", CsvPreset] | None, _meaning("the format by its name, or none; else it is recognised")
+    ] = None
     time_unit: Annotated[CsvTimeUnit | None, _meaning("unit of the time column of the IMU's file")] = None
     vps_time_unit: Annotated[CsvTimeUnit | None, _meaning("unit of the VPS's time column, where it does not say")] = (
         None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 import types
 from collections.abc import Mapping
@@ -74,7 +75,9 @@ def _told(
             return ReasonCode.WRONG_TYPE, f"{NEEDED[kind]} is needed here, not {shown(value)}"
     if kind == "literal_error":
         allowed = re.findall("'([^']*)'", str(context["expected"]))
-        return ReasonCode.WRONG_VALUE, f"{shown(value)} is not one of {', '.join(allowed)}"
+        nearest = difflib.get_close_matches(str(value).lower(), allowed, n=1)
+        hint = f'; did you mean "{nearest[0]}"?' if nearest else ""
+        return ReasonCode.WRONG_VALUE, f"{shown(value)} is not one of {', '.join(allowed)}{hint}"
     if kind == "string_too_long":
         return ReasonCode.WRONG_VALUE, f"a single character is needed here, not {shown(value)}"
     return ReasonCode.WRONG_VALUE, f"{shown(value)} is not allowed; it must be {_limits(kind, model, loc)}"

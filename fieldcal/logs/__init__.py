@@ -52,7 +52,7 @@ def open_log(path: Path, vehicle: Vehicle) -> LogReader:
     ----------
     path : Path
         An `.mcap`, `.mcap.zstd`, `.bag`, `.db3`, `.ulg`, `.bin` (ArduPilot) or `.csv` file, a rosbag2 folder, or a
-        folder with `imu.csv`.
+        folder with `imu.csv` or a known exporter's files.
     vehicle : Vehicle
         Configuration of its vehicle: topics, columns, units.
 

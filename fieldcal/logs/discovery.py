@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Protocol
 
+from fieldcal.logs.csv.folder import folder_layout
 from fieldcal.logs.interface import LogFile
 from fieldcal.logs.rosbag2.parts import bag_files, is_bag_folder
 
@@ -47,10 +48,10 @@ class LogsEntry(Protocol):
 def log_format(path: Path) -> str | None:
     """The format that a path's name promises, or None when it is no log.
 
-    A folder with `imu.csv` counts as csv, one with the files of a ROS 2 bag as rosbag2.
+    A folder with `imu.csv` or a known exporter's files counts as csv, one with those of a ROS 2 bag as rosbag2.
     """
     if path.is_dir():
-        if (path / "imu.csv").is_file():
+        if folder_layout(path) is not None:
             return CSV_FOLDER
         return BAG_FOLDER if is_bag_folder(path) else None
     name = path.name.lower()

@@ -203,7 +203,7 @@ def test_settings_are_plain_json_and_leave_names_out() -> None:
         ("[vehicles.a.method]\ngyroscope = 'magic'", "wrong_value", '"magic" is not one of auto, serial, joint'),
         ("[vehicles.a.method]\ngyro = 'joint'", "unknown_key", 'did you mean "gyroscope"?'),
         ("[vehicles.a]\nmethod = 'magic'", "wrong_value", '"magic" is not one of auto, serial, joint'),
-        ("[vehicles.a]\nworld = 'NED'", "wrong_value", "not one of ned, enu"),
+        ("[vehicles.a]\nworld = 'NED'", "wrong_value", 'not one of ned, enu; did you mean "ned"'),
         ("[vehicles.a]\nimu_id = 7", "wrong_type", "a text is needed here, not 7"),
         ("[vehicles.a]\nunits = { gyroscope = 'T' }", "wrong_value", "counts, rad/s, deg/s"),
         ("[vehicles.a]\ngravity_mps2 = 981", "wrong_value", "from 9.7 to 9.9"),

@@ -8,6 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 ANGLES = ("roll", "pitch", "yaw")
+MATRIX = tuple(f"r{row}{column}" for column in "xyz" for row in "xyz")
+"""Elements of the matrix from body to world, column by column."""
+VECTOR = ("rotation_x", "rotation_y", "rotation_z")
+"""A rotation vector from body to world, rad."""
 TO_RAD = {"deg": np.pi / 180.0, "rad": 1.0}
 _UNIT = re.compile(r"\s*[(\[{][^()\[\]{}]*[)\]}]\s*$")
 _AXIS_LAST = re.compile(r"(.*?)[ _.:/-]?([wxyz])$")

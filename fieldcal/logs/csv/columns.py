@@ -6,9 +6,10 @@ import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from fieldcal.config.configuration import CsvMap
 from fieldcal.config.values import Paths
 from fieldcal.errors import UnreadableLog
-from fieldcal.logs.csv.attitude import ANGLES, quaternion_by_names
+from fieldcal.logs.csv.attitude import ANGLES, MATRIX, VECTOR, quaternion_by_names
 from fieldcal.logs.csv.dialect import Dialect
 from fieldcal.logs.csv.units import sensor_unit
 from fieldcal.logs.interface import LogSummary
@@ -28,6 +29,8 @@ VPS_DEFAULTS: dict[str, tuple[str, ...]] = {
     "quaternion_xyzw": ("qx", "qy", "qz", "qw"),
     "quaternion_wxyz": (),
     "roll_pitch_yaw": (),
+    "rotation_matrix": (),
+    "rotation_vector": (),
     "position": ("px", "py", "pz"),
 }
 AXES: dict[str, tuple[str, ...]] = {key: tuple(f"{key}_{axis}" for axis in "xyz") for key in SENSORS}
@@ -35,8 +38,12 @@ POWER_COLUMNS = {"current": ("current_a",), "throttle": ("throttle",)}
 VPS_COLUMNS = {
     "quaternion_xyzw": ("qx", "qy", "qz", "qw"),
     "roll_pitch_yaw": ANGLES,
+    "rotation_matrix": MATRIX,
+    "rotation_vector": VECTOR,
     "position": ("px_m", "py_m", "pz_m"),
 }
+OTHER_ATTITUDES = ("roll_pitch_yaw", "rotation_matrix", "rotation_vector")
+"""Attitudes of a VPS that become a quaternion."""
 OPTIONAL = ("temperature", "current", "throttle", "position")
 """What a log may lack although it is configured."""
 TIME_DEFAULTS = tuple(
@@ -96,6 +103,18 @@ def signal_groups(
     ]
 
 
+def known_by_names(dialect: Dialect, csv: CsvMap) -> set[str]:
+    """Tables ("imu", "vps") that default or configured names tell: a sensor, or an attitude and its time."""
+
+    def has_default(names: Sequence[str]) -> bool:
+        return any(name in dialect.names for name in names)
+
+    known = {"imu"} if any(sensor in csv.imu or has_default(IMU_DEFAULTS[sensor]) for sensor in SENSORS) else set()
+    attitude = has_default(VPS_DEFAULTS["quaternion_xyzw"]) or quaternion_by_names(dialect.names) is not None
+    timed = csv.rate_hz is not None or has_default(TIME_DEFAULTS)
+    return known | ({"vps"} if csv.vps or (attitude and timed) else set())
+
+
 def attitude_columns(dialect: Dialect, columns: Columns) -> Columns:
     """Columns of a VPS with at most one attitude: the configured one, else the default, else one that names tell.
 
@@ -105,7 +124,7 @@ def attitude_columns(dialect: Dialect, columns: Columns) -> Columns:
     if "quaternion_wxyz" in values:
         w, *xyz = values.pop("quaternion_wxyz")
         values["quaternion_xyzw"] = (*xyz, w)
-    elif "roll_pitch_yaw" in values:
+    elif any(key in values for key in OTHER_ATTITUDES):
         values.pop("quaternion_xyzw", None)
     elif "quaternion_xyzw" not in values:
         named = quaternion_by_names(dialect.names)
@@ -133,13 +152,13 @@ def without_absent(
     return kept
 
 
-def no_attitude(dialect: Dialect, log_name: str) -> UnreadableLog:
-    """The refusal of a VPS's file whose attitude is not understood."""
+def no_attitude(dialect: Dialect, log_name: str, hint: str) -> UnreadableLog:
+    """The refusal of a VPS's file whose attitude is not understood; `hint` ends its sentence."""
     listed = ", ".join(name for name in dialect.names[:20] if name)
     return UnreadableLog(
         ReasonCode.MISSING_COLUMN,
         f"{log_name} has no known quaternion columns; it has {listed}. Name them as csv.vps.quaternion_xyzw or "
-        "csv.vps.quaternion_wxyz, or angles (yaw, pitch, roll applied in this order) as csv.vps.roll_pitch_yaw.",
+        f"csv.vps.quaternion_wxyz, or angles (yaw, pitch, roll applied in this order) as csv.vps.roll_pitch_yaw.{hint}",
     )
 
 
@@ -147,7 +166,7 @@ def declared_units(dialect: Dialect, columns: Columns, summary: LogSummary, log_
     """Unit of each sensor as its columns say it. Axes that disagree are a finding and give none."""
     units = {}
     for sensor, positions in columns.values.items():
-        if sensor not in ("gyroscope", "accelerometer", "magnetometer"):
+        if sensor not in SENSORS:
             continue
         row = dialect.unit_row
         found = {sensor_unit(sensor, dialect.names[place], row[place] if row else None) for place in positions}

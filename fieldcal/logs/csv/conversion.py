@@ -9,14 +9,25 @@ from numpy.typing import NDArray
 
 from fieldcal.config.configuration import CsvMap
 from fieldcal.errors import UnreadableLog
-from fieldcal.geometry.rotation import from_euler
-from fieldcal.logs.csv.attitude import ANGLES, TO_RAD
+from fieldcal.geometry.rotation import (
+    body_from_inertial,
+    from_euler,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    parallel_to_quaternion,
+)
+from fieldcal.logs.csv.attitude import ANGLES, MATRIX, TO_RAD, VECTOR
 from fieldcal.logs.csv.columns import Columns
 from fieldcal.logs.csv.dialect import Dialect
 from fieldcal.logs.csv.units import TO_DEGC, angle_unit, prefixed_unit, temperature_unit
 from fieldcal.logs.interface import LogSummary
 from fieldcal.names import Sensor
 from fieldcal.reason_codes import ReasonCode
+
+QUATERNION, POSITION = ("qx", "qy", "qz", "qw"), ("px_m", "py_m", "pz_m")
+ROTATION_TOLERANCE = 0.05
+"""Of a matrix's determinant from 1: more than rounding to two digits makes."""
 
 
 def sensor_factors(
@@ -72,7 +83,40 @@ def radians(csv: CsvMap, dialect: Dialect, columns: Columns, log_name: str) -> f
 
 
 def with_quaternion(values: Mapping[str, NDArray[np.float64]], to_rad: float) -> dict[str, NDArray[np.float64]]:
-    """Columns of a VPS with its angles, body to world (yaw, then pitch, then roll), turned into a quaternion."""
-    q = np.asarray(from_euler(np.stack([values[name] * to_rad for name in ANGLES], axis=1)), dtype=np.float64)
-    turned = {name: q[:, k].copy() for k, name in enumerate(("qx", "qy", "qz", "qw"))}
-    return turned | {name: column for name, column in values.items() if name not in ANGLES}
+    """Columns of a VPS with its attitude, if it is none yet, turned into a quaternion: angles, body to world (yaw, then
+    pitch, then roll), a rotation vector, or a matrix. A matrix that is no rotation becomes the zero quaternion, which
+    is no attitude."""
+    if "qx" in values:
+        return dict(values)
+    if ANGLES[0] in values:
+        q = np.asarray(from_euler(np.stack([values[name] * to_rad for name in ANGLES], axis=1)))
+    elif VECTOR[0] in values:
+        q = np.asarray(from_rotation_vector(np.stack([values[name] for name in VECTOR], axis=1)))
+    else:
+        # Column by column body to world is row by row world to body.
+        matrices = np.stack([values[name] for name in MATRIX], axis=1).reshape(-1, 3, 3)
+        proper = np.abs(np.linalg.det(matrices) - 1.0) < ROTATION_TOLERANCE
+        q = np.zeros((len(matrices), 4))
+        q[proper] = normalise(parallel_to_quaternion(matrices[proper]))
+    turned = _named(QUATERNION, q)
+    return turned | {name: column for name, column in values.items() if name not in (*ANGLES, *VECTOR, *MATRIX)}
+
+
+def in_world(
+    values: Mapping[str, NDArray[np.float64]], turn: tuple[float, float, float, float] | None, metre: float
+) -> dict[str, NDArray[np.float64]]:
+    """Poses, with a quaternion, in another world: turned by the quaternion `turn`, positions times `metre` in m."""
+    moved = dict(values)
+    if POSITION[0] in moved:
+        p = np.stack([moved[name] for name in POSITION], axis=1) * metre
+        if turn is not None:
+            p = p @ body_from_inertial(turn)
+        moved |= _named(POSITION, p)
+    if turn is not None:
+        q = multiply(turn, np.stack([moved[name] for name in QUATERNION], axis=1))
+        moved |= _named(QUATERNION, q)
+    return moved
+
+
+def _named(names: tuple[str, ...], values: NDArray[np.floating]) -> dict[str, NDArray[np.float64]]:
+    return {name: values[:, k].astype(np.float64) for k, name in enumerate(names)}

@@ -21,6 +21,8 @@ _LINES_LOOKED_AT = 50
 _PREAMBLE_LINES_CAP = 1000
 COMMENTS = ("#", "//")
 COLUMNS_CAP = 10_000
+HEADERS_BELOW = (("Format Version,", "Frame,Time"),)
+"""Beginnings of a first line that may by chance have as many cells as the rows (Motive's), and of the header below."""
 LEAST_FIELDS = 4
 """A time and the axes of one sensor: rows of fewer cells show no header below the first line."""
 
@@ -73,7 +75,7 @@ def find_dialect(block: bytes, log_name: str, separator: str | None, decimal: st
         `missing_header`, `not_text`, `no_rows`, `too_many_columns`.
     """
     lines = block.split(b"\n", _PREAMBLE_LINES_CAP)[:_PREAMBLE_LINES_CAP]
-    texts = [_text(line) for line in lines]
+    texts = [line_text(line) for line in lines]
     body = [number for number, text in enumerate(texts) if text.strip() and not text.lstrip().startswith(COMMENTS)]
     if not body:
         raise UnreadableLog(ReasonCode.NO_ROWS, f"{log_name} holds no rows. Nothing was recorded.")
@@ -121,6 +123,10 @@ def header_place(texts: list[str], separator: str | None, decimal: str | None) -
     Exporters put a preamble above the header ("key,value" lines, a title). It is looked for only where the first line
     does not fit what follows it, and only taken where a line of names with as many cells as the rows is found.
     """
+    for title, header in HEADERS_BELOW:
+        below = [place for place, line in enumerate(texts) if line.startswith(header)]
+        if texts[0].startswith(title) and below:
+            return below[0]
     data = texts[1:_LINES_LOOKED_AT]
     first = separator or _separator(texts[0], data)
     fields = len(cells_of(texts[0], first))
@@ -151,7 +157,8 @@ def _is_row(line: str, separator: str, fields: int, decimal: str | None) -> bool
     return len(cells) - fields in (0, 1) and 2 * numbers > len(filled)
 
 
-def _text(line: bytes) -> str:
+def line_text(line: bytes) -> str:
+    """A line as text: UTF-8, else Latin-1, without a byte-order mark."""
     try:
         return line.decode("utf-8").strip("﻿")
     except UnicodeDecodeError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ from fieldcal.logs.csv import conversion, instances
 from fieldcal.logs.csv.clock import FileClock
 from fieldcal.logs.csv.dialect import cells_of, find_dialect
 from fieldcal.logs.csv.losses import Losses
+from fieldcal.logs.csv.presets.choice import only_by_name, read_as
+from fieldcal.logs.csv.presets.layout import ATTITUDES, layout_of
 from fieldcal.logs.csv.rows import numbers_of, other_header, read_rows
 from fieldcal.logs.csv.text import LineBlocks
 from fieldcal.logs.csv.time import looks_iso8601, looks_time_of_day, sample_times
@@ -41,9 +44,19 @@ class CsvTable:
         Which of "imu" and "vps" to look for in it.
     summary : LogSummary
         Receives findings and counts.
+    join : SensorJoin, optional
+        Takes the readings of gyroscope and accelerometer, where they stand in files of their own.
     """
 
-    def __init__(self, path: Path, name: str, vehicle: Vehicle, tables: tuple[str, ...], summary: LogSummary) -> None:
+    def __init__(
+        self,
+        path: Path,
+        name: str,
+        vehicle: Vehicle,
+        tables: tuple[str, ...],
+        summary: LogSummary,
+        join: SensorJoin | None = None,
+    ) -> None:
         self._name = name
         self._summary = summary
         self._csv = vehicle.csv
@@ -51,6 +64,12 @@ class CsvTable:
         first = next(iter(self._blocks), b"")
         self.dialect = find_dialect(first, self._name, self._csv.separator, self._csv.decimal)
         self._first_cells = self._cells_of_first_row(first)
+        layout = layout_of(first, self.dialect, self._first_cells)
+        self._as = read_as(self._csv, layout, tables, columns_of.known_by_names(self.dialect, self._csv), name)
+        if self._as.meaning.names:
+            self.dialect = replace(self.dialect, names=self._as.meaning.names)
+        self._rate_hz = self._as.rate_hz(self._csv)
+        self._only_by_name = only_by_name(layout) if self._as.preset is None and self._csv.preset is None else ""
         self._clocks: dict[int, FileClock] = {}
         self._to_rad = 1.0
         self._to_degc = 1.0, 0.0
@@ -59,11 +78,16 @@ class CsvTable:
         self.units: dict[str, str] = {}
         self._factors: dict[str, float] = {}
         if self.imu is not None:
-            declared = columns_of.declared_units(self.dialect, self.imu, summary, name)
-            self.units, self._factors = conversion.sensor_factors(declared, vehicle.units, summary, name)
+            own = self._as.units(self.imu.values, self._csv.imu)
+            others = {key: places for key, places in self.imu.values.items() if key not in own}
+            by_names = columns_of.declared_units(self.dialect, replace(self.imu, values=others), summary, name)
+            self.units, self._factors = conversion.sensor_factors({**by_names, **own}, vehicle.units, summary, name)
+            for sensor in own.keys() - vehicle.units.keys():
+                self._factors[sensor] = self._factors.get(sensor, 1.0) * self._as.meaning.factors.get(sensor, 1.0)
             if "temperature" in self.imu.values:
                 self._to_degc = conversion.temperature_scale(self.dialect, self.imu, summary, name)
-        if self.dialect.preamble:
+        self._as.tell(summary, name)
+        if self.dialect.preamble and self._as.preset is None:
             summary.add(
                 ReasonCode.PREAMBLE,
                 self.dialect.preamble,
@@ -71,7 +95,8 @@ class CsvTable:
                 "above it were passed over.",
             )
         self._instance_place = self._instances(first)
-        self._join = SensorJoin() if self._sensors_stand_apart(first) else None
+        self._joins_itself = join is None
+        self._join = SensorJoin() if join is None and self._sensors_stand_apart(first) else join
 
     def batches(self) -> Iterator[Batch]:
         """Signal batches, block by block."""
@@ -118,25 +143,30 @@ class CsvTable:
         return sorted(wanted)
 
     def _imu_columns(self) -> columns_of.Columns:
-        wanted = columns_of.without_absent(self.dialect, self._csv.imu, "imu", self._summary, self._name)
+        configured = columns_of.without_absent(self.dialect, self._csv.imu, "imu", self._summary, self._name)
+        wanted = self._as.columns("imu", configured)
         found = columns_of.find_columns(self.dialect, wanted, columns_of.IMU_DEFAULTS, "imu", self._name)
         if found.values:
-            self._set_clock(found.time, self._csv.time_unit)
+            self._set_clock(found.time, self._csv.time_unit or self._as.time_unit("imu", configured))
         return found
 
     def _vps_columns(self, *, alone: bool) -> columns_of.Columns | None:
         """Columns of the VPS. In a file that is the IMU's too, what is wrong with them is told and nothing else."""
         try:
-            wanted = columns_of.without_absent(self.dialect, self._csv.vps, "vps", self._summary, self._name)
+            configured = columns_of.without_absent(self.dialect, self._csv.vps, "vps", self._summary, self._name)
+            wanted = self._as.columns("vps", configured)
+            if not wanted and self._as.has("imu"):  # what looks like an attitude there is the IMU's own estimate
+                return None
             found = columns_of.find_columns(self.dialect, wanted, columns_of.VPS_DEFAULTS, "vps", self._name)
             found = columns_of.attitude_columns(self.dialect, found)
             if "roll_pitch_yaw" in found.values:
                 self._to_rad = conversion.radians(self._csv, self.dialect, found, self._name)
-            elif "quaternion_xyzw" not in found.values:
+            elif not set(ATTITUDES) & found.values.keys():
                 if alone:
-                    raise columns_of.no_attitude(self.dialect, self._name)
+                    raise columns_of.no_attitude(self.dialect, self._name, self._only_by_name)
                 return None
-            self._set_clock(found.time, self._csv.vps_time_unit, otherwise=self._csv.time_unit)
+            unit = self._csv.vps_time_unit or self._as.time_unit("vps", configured)
+            self._set_clock(found.time, unit, otherwise=self._csv.time_unit)
         except UnreadableLog as error:
             if alone:
                 raise
@@ -190,13 +220,13 @@ class CsvTable:
                 return cells_of(text, self.dialect.separator)
         return []
 
-    def _set_clock(self, place: int | None, unit: CsvTimeUnit | None, otherwise: CsvTimeUnit | None = None) -> None:
-        """The clock of a time column: its unit is the configured one, else what the column says, else `otherwise`.
+    def _set_clock(self, place: int | None, unit: str | None, otherwise: CsvTimeUnit | None = None) -> None:
+        """The clock of a time column: its unit is the known one, else what the column says, else `otherwise`.
 
         A clock that is set already stays: the IMU's, where the VPS has the same column.
         """
         if place is None:
-            if not self._csv.rate_hz:
+            if not self._rate_hz:
                 raise UnreadableLog(
                     ReasonCode.MISSING_TIME,
                     f"{self._name} has no time column among {', '.join(self.dialect.names[:20])}. Name it as csv.imu.t "
@@ -209,10 +239,10 @@ class CsvTable:
         own = time_unit(self.dialect.names[place], row[place] if row else None)
         cell = self._first_cells[place] if place < len(self._first_cells) else ""
         seen = "iso8601" if looks_iso8601(cell) else "time_of_day" if looks_time_of_day(cell) else None
-        default = None if self._csv.rate_hz else "s"
+        default = None if self._rate_hz else "s"
         # A column's name gives the unit of numbers; its cells may yet be times of day.
         found = unit or (seen if own == "s" else None) or own or seen or otherwise or default
-        self._clocks[place] = FileClock(found, self._csv.rate_hz, self._csv.clock_period_s)
+        self._clocks[place] = FileClock(found, self._rate_hz, self._csv.clock_period_s)
 
     def _block(
         self, frame: pl.DataFrame, numbers: NDArray[np.int64], places: NDArray[np.int64], losses: Losses
@@ -227,7 +257,7 @@ class CsvTable:
             if columns is None or not groups:
                 continue
             if columns.time is None:
-                t_ns, sound = sample_times(places, self._csv.rate_hz or 1.0), np.ones(len(places), bool)
+                t_ns, sound = sample_times(places, self._rate_hz or 1.0), np.ones(len(places), bool)
             else:
                 t_ns, sound = times[columns.time]
             values = {
@@ -251,7 +281,7 @@ class CsvTable:
             kept = sound & there.all(axis=0) & ~bad & of_unit
             if not kept.any():
                 continue
-            batch = self._batch(t_ns[kept], {out: column[kept] for out, column in values.items()})
+            batch = self._batch(table, t_ns[kept], {out: column[kept] for out, column in values.items()})
             self._summary.epoch_known |= columns.time is not None and stamps_are_epoch(t_ns[kept])
             if self._join is not None and table in INERTIAL:
                 self._join.add(table, t_ns[kept], np.column_stack([batch[out] for out in required]))
@@ -259,19 +289,21 @@ class CsvTable:
             self._summary.count_rows(table, batch)
             yield table, batch
 
-    def _batch(self, t_ns: NDArray[np.int64], values: dict[str, NDArray[np.float64]]) -> BatchColumns:
+    def _batch(self, table: str, t_ns: NDArray[np.int64], values: dict[str, NDArray[np.float64]]) -> BatchColumns:
         """Rows of one table in the units that are delivered."""
         for sensor, factor in self._factors.items():
             values |= {out: values[out] * factor for out in columns_of.AXES[sensor] if out in values}
         if "temperature_degc" in values and self._to_degc != (1.0, 0.0):
             values["temperature_degc"] = values["temperature_degc"] * self._to_degc[0] + self._to_degc[1]
-        if "roll" in values:
+        if table == "vps":
             values = conversion.with_quaternion(values, self._to_rad)
+            if self._as.has("vps"):
+                values = conversion.in_world(values, self._as.meaning.world_from_logged, self._as.meaning.metre)
         return {"t_ns": t_ns, **values}
 
     def _joined(self) -> Iterator[Batch]:
         """Rows of sensors that stand in rows of their own."""
-        found = self._join.joined(self._name) if self._join is not None else None
+        found = self._join.joined(self._name) if self._join is not None and self._joins_itself else None
         if found is not None:
             batch, finding = found
             self._summary.findings.append(finding)

@@ -8,8 +8,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-NANOSECONDS_OF = {"s": 9, "ms": 6, "us": 3, "ns": 0}
-"""Time unit -> decimal digits down to the nanosecond."""
+NANOSECONDS_OF = {"s": 9, "ms": 6, "100us": 5, "us": 3, "ns": 0}
+"""Time unit -> decimal digits down to the nanosecond. "100us" are ticks of 10 kHz, which presets alone name."""
 
 _DECIMAL = r"^([+-]?)(\d*)(?:\.(\d*))?$"
 _ISO = r"^(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d+))?\s*(Z|z|[+-]\d\d:?\d\d)?$"
