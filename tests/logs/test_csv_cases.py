@@ -201,3 +201,7 @@ def test_one_of_two_imus_is_chosen(tmp_path_factory: pytest.TempPathFactory, ins
     document = fieldcal.calibrate(folder / "log", method="serial", config=config).document
     assert document["flight"]["imu_rate_hz"] == pytest.approx(185.12, abs=0.02)
     assert scales(document) == pytest.approx(scale, rel=0.025)
+    other = fieldcal.calibrate(folder / "log", method="serial", config=config, unit="imu.1").document
+    left_out, others_scale = {"0": ("1", (0.990, 0.956, 0.981)), "1": ("0", (1.02, 0.985, 1.01))}[instance]
+    assert {row["unit_id"].rpartition("/")[2] for row in other["calibration"]} == {left_out}
+    assert scales(other) == pytest.approx(others_scale, rel=0.025)

@@ -331,7 +331,7 @@ def test_two_imus_in_one_file_are_refused_or_split(tmp_path: Path) -> None:
     with pytest.raises(UnreadableLog) as refused:
         read(tmp_path, two_imus())
     assert refused.value.reason_code == "several_units"
-    assert "column 'I': 0, 1. Choose one: set csv.instance to '0' or '1'" in refused.value.sentence
+    assert "column 'I': 0, 1. Choose the primary one: set csv.instance to '0' or '1'" in refused.value.sentence
     for chosen in (0, 1):
         frames, summary = read(tmp_path, two_imus(), vehicle(csv=CsvMap(instance=str(chosen))))
         assert frames["imu"]["gyroscope_x"].to_list() == [10 * chosen + i for i in range(chosen, 60, 2)]

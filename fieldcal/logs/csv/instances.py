@@ -1,4 +1,5 @@
-"""Several IMUs in one CSV file, a column telling them apart: one is chosen, or the file is refused."""
+"""Several IMUs in one CSV file, a column telling them apart: one is chosen as the primary one, or the file is
+refused."""
 
 from __future__ import annotations
 
@@ -36,6 +37,11 @@ def interleaved(cells: pl.Series) -> list[str]:
     return sorted(values) if switches > INTERLEAVED_SHARE * len(present) else []
 
 
+def names_in(cells: pl.Series) -> list[str]:
+    """The names of the IMUs of some rows."""
+    return sorted(cells.str.strip_chars().drop_nulls().unique().to_list())[:MOST_UNITS]
+
+
 def rows_of(cells: pl.Series, instance: str) -> NDArray[np.bool_]:
     """Which rows are of one IMU."""
     return (cells.str.strip_chars() == instance).fill_null(False).to_numpy()
@@ -45,14 +51,15 @@ def several_units(name: str, column: str, values: list[str]) -> UnreadableLog:
     """The refusal of a file with rows of several IMUs of which none is chosen."""
     return UnreadableLog(
         ReasonCode.SEVERAL_UNITS,
-        f"{name} holds rows of several IMUs, told apart by column {column!r}: {', '.join(values)}. Choose one: set "
-        f"csv.instance to {' or '.join(repr(value) for value in values)}.",
+        f"{name} holds rows of several IMUs, told apart by column {column!r}: {', '.join(values)}. Choose the primary "
+        f"one: set csv.instance to {' or '.join(repr(value) for value in values)}; the others are calibrated as "
+        "further units.",
     )
 
 
 def absent_unit(name: str, column: str, cells: pl.Series, instance: str) -> UnreadableLog:
     """The refusal of a file in which the chosen IMU is not to be found."""
-    there = sorted(cells.str.strip_chars().drop_nulls().unique().to_list())[:MOST_UNITS]
+    there = names_in(cells)
     return UnreadableLog(
         ReasonCode.SEVERAL_UNITS,
         f"No row of {name} says {instance!r} in column {column!r}, which csv.instance asks for; there are "

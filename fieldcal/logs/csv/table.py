@@ -23,6 +23,7 @@ from fieldcal.logs.csv.rows import numbers_of, other_header, read_rows
 from fieldcal.logs.csv.text import LineBlocks
 from fieldcal.logs.csv.time import looks_iso8601, looks_time_of_day, sample_times
 from fieldcal.logs.csv.units import time_unit
+from fieldcal.logs.further_units import FurtherUnits
 from fieldcal.logs.interface import Batch, LogSummary, stamps_are_epoch
 from fieldcal.logs.interface import Columns as BatchColumns
 from fieldcal.logs.joining import INERTIAL, SensorJoin, stand_apart
@@ -95,6 +96,7 @@ class CsvTable:
                 "above it were passed over.",
             )
         self._instance_place = self._instances(first)
+        self._further = FurtherUnits()
         self._joins_itself = join is None
         self._join = SensorJoin() if join is None and self._sensors_stand_apart(first) else join
 
@@ -249,9 +251,8 @@ class CsvTable:
     ) -> Iterator[Batch]:
         cells = {name: numbers_of(frame[name]) for name in self._numeric()}
         times = {place: clock.times(frame[str(place)]) for place, clock in self._clocks.items()}
-        chosen = np.ones(len(numbers), bool)
-        if self._instance_place is not None and self._csv.instance is not None:
-            chosen = instances.rows_of(frame[str(self._instance_place)], self._csv.instance)
+        units = self._units(frame)
+        everything = {"": np.ones(len(numbers), bool)}
         for table, groups in columns_of.signal_groups(self.imu, self.vps, apart=self._join is not None):
             columns = self.imu if table != "vps" else self.vps
             if columns is None or not groups:
@@ -273,21 +274,32 @@ class CsvTable:
             there = np.stack([np.isfinite(values[out]) for out in required])
             if table == "power":
                 there = np.stack([there.any(axis=0)])  # one of the two will do
-            of_unit = chosen | (table == "vps")
-            absent = (~there.any(axis=0) & ~bad) | ~of_unit
-            losses.add(ReasonCode.BAD_NUMBER, numbers[bad & of_unit])
-            losses.add(ReasonCode.INCOMPLETE_ROW, numbers[~there.all(axis=0) & ~absent & ~bad])
-            losses.add(ReasonCode.BAD_TIME, numbers[~sound & there.all(axis=0) & ~bad & of_unit])
-            kept = sound & there.all(axis=0) & ~bad & of_unit
-            if not kept.any():
-                continue
-            batch = self._batch(table, t_ns[kept], {out: column[kept] for out, column in values.items()})
-            self._summary.epoch_known |= columns.time is not None and stamps_are_epoch(t_ns[kept])
-            if self._join is not None and table in INERTIAL:
-                self._join.add(table, t_ns[kept], np.column_stack([batch[out] for out in required]))
-                continue
-            self._summary.count_rows(table, batch)
-            yield table, batch
+            whole = there.all(axis=0)
+            for unit_id, of_unit in (everything if table == "vps" else units).items():
+                losses.add(ReasonCode.BAD_NUMBER, numbers[bad & of_unit])
+                losses.add(ReasonCode.INCOMPLETE_ROW, numbers[~whole & there.any(axis=0) & of_unit & ~bad])
+                losses.add(ReasonCode.BAD_TIME, numbers[~sound & whole & ~bad & of_unit])
+                kept = sound & whole & ~bad & of_unit
+                if not kept.any():
+                    continue
+                batch = self._batch(table, t_ns[kept], {out: column[kept] for out, column in values.items()})
+                self._summary.epoch_known |= columns.time is not None and stamps_are_epoch(t_ns[kept])
+                if self._join is not None and table in INERTIAL:
+                    if not unit_id:
+                        self._join.add(table, t_ns[kept], np.column_stack([batch[out] for out in required]))
+                    continue
+                placed = self._further.placed((table, batch), unit_id or self._name, unit_id)
+                if placed is not None:
+                    self._summary.count_rows(*placed)
+                    yield placed
+
+    def _units(self, frame: pl.DataFrame) -> dict[str, NDArray[np.bool_]]:
+        """Which rows are of which IMU: those of the chosen one under "", others under their names."""
+        if self._instance_place is None or self._csv.instance is None:
+            return {"": np.ones(frame.height, bool)}
+        cells = frame[str(self._instance_place)]
+        others = [name for name in instances.names_in(cells) if name != self._csv.instance]
+        return {"": instances.rows_of(cells, self._csv.instance), **{n: instances.rows_of(cells, n) for n in others}}
 
     def _batch(self, table: str, t_ns: NDArray[np.int64], values: dict[str, NDArray[np.float64]]) -> BatchColumns:
         """Rows of one table in the units that are delivered."""
@@ -315,6 +327,7 @@ class CsvTable:
         return sorted({str(place) for table in tables for places in table.values.values() for place in places})
 
     def _report(self, losses: Losses) -> None:
+        self._further.tell(self._summary, self._name)
         bad_times = [clock.bad_cell for clock in self._clocks.values() if clock.bad_cell is not None]
         self._summary.findings += losses.findings(self._name, bad_times[0] if bad_times else None)
         for clock in self._clocks.values():

@@ -52,7 +52,7 @@ def by_frame(
             ReasonCode.SEVERAL_UNITS,
             f"{log_name}: messages of several IMUs alternate on {source.topic}, told apart by frame_id: "
             f"{', '.join(listed)}. Choose the primary one: set mcap.frame_id to "
-            f"{' or '.join(repr(name) for name in listed)}; the others are then calibrated as further units.",
+            f"{' or '.join(repr(name) for name in listed)}; the others are calibrated as further units.",
         )
     return everything
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fieldcal.config.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.encodings.decoded import COMPONENTS, Decoded
+from fieldcal.logs.further_units import FurtherUnits
 from fieldcal.logs.interface import Batch, Columns, LogSummary, logged_units, stamps_are_epoch
 from fieldcal.logs.joining import INERTIAL, SensorJoin, triad
 from fieldcal.logs.messages.container import Block, Container
@@ -18,8 +19,6 @@ from fieldcal.logs.messages.packed import PackedPayloads
 from fieldcal.logs.messages.roles import METADATA_NAME, SI_TYPES, choose_sources
 from fieldcal.logs.messages.source import Source
 from fieldcal.logs.messages.transforms import tell_of_transforms
-from fieldcal.logs.messages.units import FurtherUnits
-from fieldcal.logs.on_board import tell_further_units
 from fieldcal.names import SENSORS
 from fieldcal.reason_codes import ReasonCode
 
@@ -80,7 +79,7 @@ class MessageLog:
                         if lost:
                             self._malformed[source.topic] = self._malformed.get(source.topic, 0) + lost
                         for batch in self._tables(source, decoded, some.log_time_ns):
-                            placed = self._further.table(batch, source, frame)
+                            placed = self._further.placed(batch, *_named(source, frame))
                             if placed is not None:
                                 self.summary.count_rows(*placed)
                                 yield placed
@@ -162,8 +161,7 @@ class MessageLog:
 
     def _finish(self) -> None:
         self._settle_conventions()
-        self._further.tell(self.summary)
-        tell_further_units(self.summary, self._name)
+        self._further.tell(self.summary, self._name)
         self._container.report(self.summary)
         for topic, count in self._malformed.items():
             self.summary.add(
@@ -191,6 +189,13 @@ class MessageLog:
                 f"{self._name}: not one message of {', '.join(source.topic for source in self._sources)} could be read"
                 + (f" ({told[0].sentence})" if told else "."),
             )
+
+
+def _named(source: Source, frame: str) -> tuple[str, str]:
+    """(stream, id) of a unit: by topic, and by frame_id where that tells several on one topic apart."""
+    if frame:
+        return f"{source.topic} ({frame})", f"{source.topic}:{frame}"
+    return source.topic, source.topic if source.further else ""
 
 
 def _of_channel(block: Block, channel_id: int) -> Block:

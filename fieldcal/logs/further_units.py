@@ -1,22 +1,21 @@
-"""Further IMUs and magnetometers of a log of messages: which tables they come in, and what they are called."""
+"""Further IMUs and magnetometers of a log without device ids: which tables they come in, what they are called."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 from fieldcal.logs.interface import Batch, Columns, LogSummary, SensorSource
-from fieldcal.logs.messages.source import Source
+from fieldcal.logs.on_board import tell_further_units
 from fieldcal.names import SENSORS, Sensor
 from fieldcal.schemas import signal_kind
-
-Place = tuple[str, str]
-"""Topic, and frame_id where that tells units apart; "" else."""
 
 
 @dataclass
 class _Seen:
-    """What was delivered of a table."""
+    """What was delivered of a unit's table."""
 
+    stream: str
+    unit_id: str
     sensors: tuple[Sensor, ...]
     rows: int = 0
     first_ns: int = 0
@@ -38,35 +37,33 @@ class _Seen:
 class FurtherUnits:
     """Numbers further units in the order in which they are met, IMUs and magnetometers each from 1."""
 
-    _numbers: dict[tuple[str, Place], int] = field(default_factory=dict)
+    _numbers: dict[tuple[str, str], int] = field(default_factory=dict)
     _seen: dict[str, _Seen] = field(default_factory=dict)
-    _places: dict[str, Place] = field(default_factory=dict)
 
-    def table(self, batch: Batch, source: Source, frame: str) -> Batch | None:
-        """A batch in the table of its unit; None where a unit of that kind has no such signal."""
+    def placed(self, batch: Batch, stream: str, unit_id: str) -> Batch | None:
+        """A batch in the table of its unit; None where a further unit has no such signal.
+
+        `stream`: where its readings are. `unit_id`: what tells the unit from others; empty of the primary one.
+        """
         name, columns = batch
-        place = (source.topic, frame)
-        if source.further or frame:
-            kind = "magnetometer" if name == "magnetometer" else "imu"
-            if name not in ("imu", "magnetometer", "temperature"):
-                return None
+        kind = {"magnetometer": "magnetometer", "imu": "imu", "temperature": "imu"}.get(name)
+        if unit_id and kind is None:
+            return None
+        if unit_id:
             known = [number for (of, _), number in self._numbers.items() if of == kind]
-            name = f"{name}.{self._numbers.setdefault((kind, place), len(known) + 1)}"
-        if signal_kind(name) in ("imu", "magnetometer"):
+            name = f"{name}.{self._numbers.setdefault((str(kind), unit_id), len(known) + 1)}"
+        if signal_kind(name) == kind:
             sensors = tuple(sensor for sensor in SENSORS if f"{sensor}_x" in columns)
-            self._seen.setdefault(name, _Seen(sensors)).add(columns)
-            self._places[name] = place
+            self._seen.setdefault(name, _Seen(stream, unit_id, sensors)).add(columns)
         return name, columns
 
-    def tell(self, summary: LogSummary) -> None:
+    def tell(self, summary: LogSummary, log_name: str) -> None:
         """Where each unit's readings were, where there are several. The primary one is the vehicle's `imu_id`."""
         if not self._numbers:
             return
         for table, seen in sorted(self._seen.items()):
-            topic, frame = self._places[table]
-            primary = table == signal_kind(table)
-            stream = f"{topic} ({frame})" if frame else topic
-            unit_id = "" if primary else f"{topic}:{frame}" if frame else topic
             summary.sources += [
-                SensorSource(sensor, table, unit_id, stream, seen.rate_hz, primary) for sensor in seen.sensors
+                SensorSource(sensor, table, seen.unit_id, seen.stream, seen.rate_hz, not seen.unit_id)
+                for sensor in seen.sensors
             ]
+        tell_further_units(summary, log_name)
