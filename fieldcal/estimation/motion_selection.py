@@ -12,6 +12,8 @@ from fieldcal.estimation.statistics import MAD_TO_SIGMA
 from fieldcal.geometry.rotation import Array
 
 REST_SHARE = 0.02  # of the sustained level: slower is rest
+BURST_S = 3.0
+"""A log that turns hard for so long and not for `min_s` is judged by that: its rest is no motion."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def select(
     """Split a log of any length into used and unused stretches.
 
     A sample is excited when the rotation in the window around it exceeds `excited_ratio` of the level that the log
-    sustains for `min_s`, and four times what the sensor's noise alone would show. Excited samples are padded by
+    sustains for `min_s` (for `BURST_S`, where that is so much stronger), and four times what the sensor's noise alone would show. Excited samples are padded by
     `pad_s` on either side, and by up to `rest_s` of rest: there the attitude is best known, which anchors the
     integrated gyroscope. Segments are cut where samples pause for more than `max_gap_s`.
 
@@ -109,8 +111,9 @@ def select(
     rate = np.asarray(rate, dtype=float)
     level_of, noise = windowed_rate(t, rate, window_s)
     interval = float(np.median(np.diff(t)))
-    sustained = min(len(t), max(1, round(min_s / interval)))
-    level = float(np.partition(level_of, len(t) - sustained)[len(t) - sustained])
+    level, burst = (_sustained(level_of, round(seconds / interval)) for seconds in (min_s, min(BURST_S, min_s)))
+    if level < excited_ratio * burst:
+        level = burst
     threshold = max(excited_ratio * level, 4.0 * noise)
     excited = level_of > threshold
     # Rest that the sensor's own noise hides is of no use: integrating it only adds the noise.
@@ -125,6 +128,12 @@ def select(
         used = _near(t[a:b], excited[a:b], pad_s) | (_near(t[a:b], excited[a:b], rest_s) & ~moving[a:b])
         segments += _cut(level_of, used, a, b, threshold)
     return Selection(segments, excited_s, level, threshold, noise)
+
+
+def _sustained(level: Array, samples: int) -> float:
+    """What level (n,) is exceeded in so many samples; in all, where there are fewer."""
+    place = len(level) - min(len(level), max(1, samples))
+    return float(np.partition(level, place)[place])
 
 
 def _near(t: Array, mark: np.ndarray, distance_s: float) -> np.ndarray:

@@ -139,3 +139,15 @@ def test_windowed_rate_is_the_moving_rms() -> None:
     assert noise == 0.0
     _, claimed = windowed_rate(t, 0.1 * np.random.default_rng(3).normal(size=rate.shape), 2.0, smooth_s=0.1)
     assert claimed == pytest.approx(0.1 * np.sqrt(3 / 10), rel=0.05)
+
+
+@pytest.mark.parametrize("lasts_s", [4.0, 8.0])
+def test_a_hard_turn_shorter_than_what_is_needed_is_not_eked_out_with_rest(t: np.ndarray, lasts_s: float) -> None:
+    """Beside it the sensor drifts a little above its own noise, which is no motion."""
+    rng = np.random.default_rng(0)
+    rate = 0.001 * autoregressive(rng, (len(t), 3), np.exp(-1.0 / RATE_HZ / 0.5)) + 1e-4 * rng.normal(size=(len(t), 3))
+    rate[(t >= BEGINS_S) & (t < BEGINS_S + lasts_s)] += [6.0, -4.0, 2.0]
+    found = select(t, rate, window_s=WINDOW_S, pad_s=PAD_S, rest_s=REST_S)
+    assert lasts_s - WINDOW_S < found.excited_s < lasts_s + WINDOW_S
+    first, last, _ = used_time(found, t)
+    assert BEGINS_S - REST_S - WINDOW_S < first < last < BEGINS_S + lasts_s + REST_S + WINDOW_S
