@@ -85,9 +85,10 @@ def select(
     """Split a log of any length into used and unused stretches.
 
     A sample is excited when the rotation in the window around it exceeds `excited_ratio` of the level that the log
-    sustains for `min_s` (for `BURST_S`, where that is so much stronger), and four times what the sensor's noise alone would show. Excited samples are padded by
-    `pad_s` on either side, and by up to `rest_s` of rest: there the attitude is best known, which anchors the
-    integrated gyroscope. Segments are cut where samples pause for more than `max_gap_s`.
+    sustains for `min_s` (for `BURST_S`, where that is so much stronger), and four times what the sensor's noise alone
+    would show. Excited samples are padded by `pad_s` on either side, and by up to `rest_s` of rest: there the attitude
+    is best known, which anchors the integrated gyroscope. Segments are cut where samples pause for more than
+    `max_gap_s`.
 
     Parameters
     ----------
