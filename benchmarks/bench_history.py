@@ -58,7 +58,7 @@ def drift_polars(warehouse: Warehouse) -> pl.DataFrame:
 
 def latest_polars(warehouse: Warehouse) -> pl.DataFrame:
     """The latest good value of every parameter of every IMU."""
-    key = ["imu_id", "sensor", "method", "parameter", "axis"]
+    key = ["unit_id", "sensor", "method", "parameter", "axis"]
     return (
         warehouse.scan("calibration")
         .filter(status="ok")
@@ -80,6 +80,8 @@ def generate(root: Path, flights: int, vehicles: int) -> None:
                 "flight_id": ids,
                 "vehicle_id": vehicle,
                 "imu_id": f"imu-{number:04d}",
+                "unit_id": f"imu-{number:04d}",
+                "is_primary": True,
                 "session_id": [f"session-{i // 5:03d}" for i in range(each)],
                 "started_at": [START.timestamp() + 86_400.0 * (i // 5) + 3_600.0 * (i % 5) for i in range(each)],
                 "temperature_degc": rng.uniform(-10.0, 45.0, each),

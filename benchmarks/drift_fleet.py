@@ -112,7 +112,7 @@ def rows_of_history(fleet: Fleet, seed: int) -> pl.DataFrame:
                 ("zero", zero, np.hypot(sd, scale_sd * np.abs(found / slope)) / np.abs(slope), "counts"),
             ):
                 parts.append(_frame(name, method, parameter, unit, value, own_sd, fleet.temperature))
-    order = ["imu_id", "sensor", "method", "parameter", "axis", "started_at", "vehicle_id", "flight_id"]
+    order = ["unit_id", "sensor", "method", "parameter", "axis", "started_at", "vehicle_id", "flight_id"]
     return pl.concat(parts).sort(order)
 
 
@@ -125,6 +125,7 @@ def _frame(
         {
             "vehicle_id": vehicle,
             "imu_id": vehicle,
+            "unit_id": vehicle,
             "session_id": [f"s{i:02d}" for i in k],
             "flight_id": [f"{i:02d}-{j:02d}" for i, j in zip(u, k, strict=True)],
             "started_at": pl.Series([START + dt.timedelta(days=7 * int(i)) for i in k], dtype=pl.Datetime("us", "UTC")),
@@ -195,7 +196,7 @@ def _vehicle_table(vehicle: str) -> str:
 
 def judged(table: pl.DataFrame, fleet: Fleet) -> dict[str, Any]:
     """What the issue's bars ask, from a table `drift`."""
-    unit = pl.col("imu_id").str.slice(5).cast(pl.Int64)
+    unit = pl.col("unit_id").str.slice(5).cast(pl.Int64)
     calibrated = table.filter(pl.col("sensor").is_in(SENSORS)).with_columns(unit=unit)
     gyro = calibrated.filter(sensor="gyroscope", parameter="zero_bias")
     coefficient = fleet.bias_per_degc["gyroscope"]
