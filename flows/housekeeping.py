@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from uuid import UUID
 
 from fieldcal.flows.alive import dead
+from fieldcal.flows.connection import connected
 
 if TYPE_CHECKING:
     from prefect.client.orchestration import SyncPrefectClient
@@ -22,14 +23,13 @@ AT_ONCE = 200
 def tidy_prefect(root: Path, url: str, *, own_server: bool) -> None:
     """End the runs of killed processes and, on a server of ours, once an hour, remove runs older than `KEPT_DAYS`."""
     from prefect.client.orchestration import get_client
-    from prefect.settings import PREFECT_API_URL, temporary_settings
 
     marks = dead(root)
     last = root / "prefect" / "tidied"
     due = own_server and not (last.exists() and time.time() - last.stat().st_mtime < EVERY_S)
     if not marks and not due:
         return
-    with temporary_settings({PREFECT_API_URL: url}), get_client(sync_client=True) as client:
+    with connected(url), get_client(sync_client=True) as client:
         for mark in marks:
             _end(client, mark)
         if due:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 from fieldcal.batch.documents import NightDocument, PlanDocument, PlannedLog, UnreadEntry
 from fieldcal.config.find import configuration_of, find_source
+from fieldcal.flows.connection import connected
 from fieldcal.flows.server import running_server
 from fieldcal.warehouse.layout import prepare
 
@@ -37,8 +38,6 @@ def run_night(
     runner, scheduler = where.get("runner") or "process", where.get("scheduler")
     with running_server(root) as server:
         starting = time.monotonic()
-        from prefect.settings import PREFECT_API_URL, temporary_settings
-
         from fieldcal.batch.night import plan_night
         from fieldcal.flows.housekeeping import tidy_prefect
         from fieldcal.flows.nightly import flow_of
@@ -54,7 +53,7 @@ def run_night(
             url = server.wait()
             start_s = imported - starting + time.monotonic() - waiting
             tidy_prefect(root, url, own_server=server.own)
-            with temporary_settings({PREFECT_API_URL: url}):
+            with connected(url):
                 planned = flow_of(night, parallel, progress, processes)
                 result = planned(str(session or archive), str(root), workers, runner)
     told: dict[str, object] = dict(result)

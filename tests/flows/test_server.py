@@ -18,8 +18,9 @@ import pytest
 from fieldcal.errors import FieldcalError
 from fieldcal.flows import housekeeping
 from fieldcal.flows.alive import FOLDER, dead
+from fieldcal.flows.connection import answers, connected
 from fieldcal.flows.run import run_night
-from fieldcal.flows.server import Server, answers, prepare_environment
+from fieldcal.flows.server import Server, prepare_environment
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 
@@ -107,9 +108,8 @@ def test_nothing_is_sent_to_others() -> None:
 
 def flow_runs(url: str) -> dict[str, str]:
     from prefect.client.orchestration import get_client
-    from prefect.settings import PREFECT_API_URL, temporary_settings
 
-    with temporary_settings({PREFECT_API_URL: url}), get_client(sync_client=True) as client:
+    with connected(url), get_client(sync_client=True) as client:
         return {str(run.id): str(run.state_type.value) for run in client.read_flow_runs() if run.state_type}
 
 
@@ -143,7 +143,6 @@ def test_old_runs_are_removed_with_their_tasks(
 ) -> None:
     from prefect.client.orchestration import get_client
     from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId, TaskRunFilter, TaskRunFilterFlowRunId
-    from prefect.settings import PREFECT_API_URL, temporary_settings
 
     before = set(flow_runs(prefect_server))
     run_night(archive, tmp_path / "warehouse")
@@ -151,7 +150,7 @@ def test_old_runs_are_removed_with_their_tasks(
 
     def tasks() -> int:
         of_run = TaskRunFilter(flow_run_id=TaskRunFilterFlowRunId(any_=[UUID(own)]))
-        with temporary_settings({PREFECT_API_URL: prefect_server}), get_client(sync_client=True) as client:
+        with connected(prefect_server), get_client(sync_client=True) as client:
             return len(client.read_task_runs(task_run_filter=of_run))
 
     give_up = time.monotonic() + 20
