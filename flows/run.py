@@ -12,6 +12,7 @@ from fieldcal.config.find import configuration_of, find_source
 from fieldcal.flows.connection import connected
 from fieldcal.flows.server import running_server
 from fieldcal.warehouse.layout import prepare
+from fieldcal.words.talk import say
 
 if TYPE_CHECKING:
     from fieldcal.batch.night import Watcher
@@ -54,8 +55,16 @@ def run_night(
             start_s = imported - starting + time.monotonic() - waiting
             tidy_prefect(root, url, own_server=server.own)
             with connected(url):
-                planned = flow_of(night, parallel, progress, processes)
-                result = planned(str(session or archive), str(root), workers, runner)
+                kept: list[NightDocument] = []
+                planned = flow_of(night, parallel, progress, processes, kept.append)
+                try:
+                    result = planned(str(session or archive), str(root), workers, runner)
+                except Exception as error:
+                    if not kept:
+                        raise
+                    result = kept[0]
+                    why = type(error).__name__
+                    say(f"Prefect's server was lost ({why}): the night is whole, Prefect's record of it is not.")
     told: dict[str, object] = dict(result)
     logs = told.pop("logs")
     told |= {"seconds": round(time.monotonic() - began, 3), "server_seconds": round(start_s, 3)}

@@ -18,6 +18,7 @@ from fieldcal.batch.documents import NightDocument
 from fieldcal.batch.night import plan_night
 from fieldcal.batch.session_folder import archive_of
 from fieldcal.errors import FieldcalError
+from fieldcal.flows.farewell import end_with_parent
 from fieldcal.flows.nightly import carry_out
 from fieldcal.flows.runners import Parallel
 from fieldcal.flows.trigger import trigger
@@ -78,6 +79,7 @@ def served_nightly(served: Served) -> Flow[..., NightDocument]:
     @flow(name="nightly", persist_result=False, validate_parameters=False)
     def nightly(archives: list[str], warehouse: str, config: str | None, workers: int) -> NightDocument:
         """Calibrate every log of the archive that is new or changed, and publish."""
+        end_with_parent()
         served.need({"archives": archives, "warehouse": warehouse, "config": config, "workers": workers})
         night = plan_night(served.archives[0], served.warehouse, served.config)
         return carry_out(night, Parallel(served.workers))
@@ -91,6 +93,7 @@ def served_session(served: Served) -> Flow[..., NightDocument]:
     @flow(name="session", persist_result=False, validate_parameters=False)
     def session(folder: str, archives: list[str], warehouse: str, config: str | None, workers: int) -> NightDocument:
         """Calibrate and publish the one session folder `<archive>/<vehicle>/<session>`."""
+        end_with_parent()
         served.need({"archives": archives, "warehouse": warehouse, "config": config, "workers": workers})
         archive, place = archive_of(Path(folder), served.archives)
         return carry_out(plan_night(archive, served.warehouse, served.config, place), Parallel(served.workers))
@@ -104,6 +107,7 @@ def served_landed(served: Served) -> Flow[..., str]:
     @flow(name="session-landed", persist_result=False, validate_parameters=False)
     def session_landed(folder: str) -> str:
         """Ask for the session as `fieldcal trigger` does, so that an event that comes twice runs it once."""
+        end_with_parent()
         url = PREFECT_API_URL.value()
         assert url is not None, "a run is started by a server"
         archive_of(Path(folder), served.archives)
