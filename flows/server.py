@@ -72,7 +72,11 @@ FOR_A_COMMAND = {
     "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_ENABLED": "false",
     "PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED": "false",
 }
-FOR_SERVING = {"PREFECT_SERVER_SERVICES_DB_VACUUM_ENABLED": "events,flow_runs"}
+# Events are three quarters of the database, and over once their triggers have heard them.
+FOR_SERVING = {
+    "PREFECT_SERVER_SERVICES_DB_VACUUM_ENABLED": "events,flow_runs",
+    "PREFECT_SERVER_EVENTS_RETENTION_PERIOD": "P1D",
+}
 # Not even the user's own settings open the server to pages of other origins.
 CLOSED = {"PREFECT_SERVER_API_CSRF_PROTECTION_ENABLED": "true"}
 

@@ -58,7 +58,7 @@ def serve(
     os.environ.setdefault("PREFECT_RUNNER_POLL_FREQUENCY", "2")
     with running_server(root, serving=True) as server:
         from fieldcal.flows.deploy import host, local_timezone, register
-        from fieldcal.flows.housekeeping import tidy_prefect
+        from fieldcal.flows.housekeeping import keep_tidy, tidy_prefect
         from fieldcal.flows.served import Served
 
         url = server.wait()
@@ -71,6 +71,7 @@ def serve(
         say(f"Serving at {url}: nightly over {place.absolute()} at {when}, into {root}")
         say("Sessions: fieldcal trigger SESSION_DIR" + (f", and by themselves in {watch}" if watch else ""))
         if server.own:
+            keep_tidy(root, url)
             say(f"The server's secret, for those who emit events or open its pages: {server.home / SECRET_FILE}")
         host(runner, url, watch.absolute() if watch else None, quiet)
     return 0

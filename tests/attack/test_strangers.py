@@ -24,6 +24,7 @@ import pytest
 from fieldcal.batch.session_folder import archive_of
 from fieldcal.cli.main import run
 from fieldcal.errors import FieldcalError
+from fieldcal.flows.alive import FOLDER as RUNNING
 from fieldcal.flows.connection import SECRET_FILE, connected, environment_for, kept_secret, new_secret
 from fieldcal.flows.server import ADDRESS, home_of, serving_address
 from fieldcal.flows.trigger import DEPLOYMENT, EVENT
@@ -32,7 +33,15 @@ from fieldcal.simulation.experiment import Experiment
 
 REPOSITORY = Path(__file__).parents[2]
 PATIENCE_S = 120.0
+GONE_WITHIN_S = 5.0
 CLEAN = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
+OPEN = {
+    "PREFECT_SERVER_CSRF_PROTECTION_ENABLED": "false",
+    "PREFECT_SERVER_API_CSRF_PROTECTION_ENABLED": "false",
+    "PREFECT_SERVER_API_CORS_ALLOWED_ORIGINS": "*",
+    "PREFECT_SERVER_API_AUTH_STRING": "",
+}
+"""Settings of the user's own that would let strangers in."""
 FOREIGN = "http://evil.example"
 TURNED_AWAY = (401, 403)
 """Without the secret; a change is asked for its token first."""
@@ -56,7 +65,7 @@ def served(place: Path) -> Iterator[Path]:
     process = subprocess.Popen(
         [sys.executable, "-m", "fieldcal", "serve", str(place / "archive"), "--warehouse", str(root)],
         cwd=REPOSITORY,
-        env=CLEAN,
+        env={**CLEAN, **OPEN},
         stderr=subprocess.PIPE,
         text=True,
     )
@@ -175,6 +184,19 @@ def test_the_secret_is_in_one_file_that_nobody_else_reads(served: Path) -> None:
             assert shown not in process.read_bytes()
         except OSError:
             continue
+
+
+def test_the_server_is_closed_whatever_else_is_set_and_its_database_bounded(served: Path) -> None:
+    from prefect.client.orchestration import get_client
+
+    with inside(served), get_client(sync_client=True) as client:
+        shown = client._client.get("/admin/settings")
+    assert secret(served) not in shown.text
+    server = shown.json()["server"]
+    assert server["api"]["csrf_protection_enabled"]
+    assert server["api"]["cors_allowed_origins"] == url(served).removesuffix("/api")
+    assert server["events"]["retention_period"] in ("P1D", 86_400.0)
+    assert set(server["services"]["db_vacuum"]["enabled"]) == {"events", "flow_runs"}
 
 
 def test_every_server_has_a_secret_of_its_own(tmp_path: Path) -> None:
@@ -326,3 +348,36 @@ def test_a_stale_secret_is_one_sentence(
     monkeypatch.delenv("PREFECT_API_AUTH_STRING")
     assert run(["nightly", str(place / "archive"), "--warehouse", str(served)]) == 1
     assert "asks for a secret. Set PREFECT_API_AUTH_STRING" in capsys.readouterr().err
+
+
+def test_serve_leaves_nobody_behind_when_it_is_killed(place: Path, served: Path) -> None:
+    from prefect.client.orchestration import get_client
+
+    (own,) = [path for path in (place / "archive").glob("sim-1/*") if not path.is_symlink()]
+    server: int = json.loads((home_of(served, serving=True) / ADDRESS).read_text())["pid"]
+    with inside(served), get_client(sync_client=True) as client:
+        deployment = client.read_deployment_by_name(f"session/{DEPLOYMENT}")
+        begun = client.create_flow_run_from_deployment(deployment.id, parameters={"folder": str(own)})
+        mark = served / RUNNING / str(begun.id)
+        wait_for(mark.exists)
+    serving = parent(server)
+    left = [pid for pid in processes() if parent(pid) == serving]
+    assert len(left) >= 2
+    os.kill(serving, signal.SIGKILL)
+    give_up = time.monotonic() + GONE_WITHIN_S
+    while alive := [pid for pid in left if parent(pid) is not None]:
+        assert time.monotonic() < give_up, alive
+        time.sleep(0.05)
+
+
+def processes() -> list[int]:
+    return [int(path.name) for path in Path("/proc").glob("[0-9]*")]
+
+
+def parent(pid: int) -> int | None:
+    """Process that started this one; None when it is gone."""
+    try:
+        state, ppid = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[:2]
+    except OSError:
+        return None
+    return None if state == "Z" else int(ppid)

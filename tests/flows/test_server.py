@@ -138,7 +138,7 @@ def test_a_killed_run_is_ended_at_the_next_start(archive: Path, tmp_path: Path, 
     assert list((root / FOLDER).iterdir()) == []
 
 
-def test_old_runs_are_removed_with_their_tasks(
+def test_old_runs_and_all_beyond_many_are_removed_with_their_tasks(
     archive: Path, tmp_path: Path, prefect_server: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from prefect.client.orchestration import get_client
@@ -161,10 +161,9 @@ def test_old_runs_are_removed_with_their_tasks(
     assert own in flow_runs(prefect_server)
 
     real = housekeeping._ended_before
-    only_own = FlowRunFilterId(any_=[UUID(own)])
 
     def narrowed(days: float) -> FlowRunFilter:
-        return FlowRunFilter(id=only_own, end_time=real(days).end_time)
+        return FlowRunFilter(id=FlowRunFilterId(any_=[UUID(own)]), end_time=real(days).end_time)
 
     monkeypatch.setattr(housekeeping, "_ended_before", narrowed)
     monkeypatch.setattr(housekeeping, "KEPT_DAYS", 0)
@@ -172,6 +171,15 @@ def test_old_runs_are_removed_with_their_tasks(
     housekeeping.tidy_prefect(tmp_path, prefect_server, own_server=True)
     assert own not in flow_runs(prefect_server)
     assert tasks() == 0
+
+    monkeypatch.setattr(housekeeping, "KEPT_DAYS", 30)
+    run_night(archive, tmp_path / "warehouse")
+    (own,) = set(flow_runs(prefect_server)) - before
+    housekeeping.tidy_prefect(tmp_path, prefect_server, own_server=True)
+    assert own in flow_runs(prefect_server)
+    monkeypatch.setattr(housekeeping, "MOST_RUNS", 0)
+    housekeeping.tidy_prefect(tmp_path, prefect_server, own_server=True)
+    assert own not in flow_runs(prefect_server)
 
 
 class Planted:
