@@ -22,10 +22,9 @@ from uuid import uuid4
 import pytest
 
 from fieldcal.batch.session_folder import archive_of
-from fieldcal.cli.main import run
 from fieldcal.errors import FieldcalError
 from fieldcal.flows.alive import FOLDER as RUNNING
-from fieldcal.flows.connection import SECRET_FILE, connected, environment_for, kept_secret, new_secret
+from fieldcal.flows.connection import SECRET, SECRET_FILE, connected, environment_for, kept_secret, new_secret
 from fieldcal.flows.server import ADDRESS, home_of, serving_address
 from fieldcal.flows.trigger import DEPLOYMENT, EVENT
 from fieldcal.simulation.archive import write_flights
@@ -45,6 +44,16 @@ OPEN = {
 FOREIGN = "http://evil.example"
 TURNED_AWAY = (401, 403)
 """Without the secret; a change is asked for its token first."""
+
+RUN_ALL = """
+import json, os, sys
+from fieldcal.cli.main import run
+codes = []
+for environment, tokens in json.loads(sys.argv[1]):
+    os.environ.update(environment)
+    codes.append(run(tokens))
+print(json.dumps(codes))
+"""
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +124,14 @@ def asked(address: str, method: str = "GET", headers: dict[str, str] | None = No
             return answer.status, dict(answer.headers)
     except urllib.error.HTTPError as error:
         return error.code, dict(error.headers)
+
+
+def in_one_process(calls: list[tuple[dict[str, str], list[str]]]) -> tuple[list[int], list[str]]:
+    """Exit codes of commands, each with its environment, and what they said on standard error."""
+    done = subprocess.run(
+        [sys.executable, "-c", RUN_ALL, json.dumps(calls)], env=CLEAN, capture_output=True, text=True, check=True
+    )
+    return json.loads(done.stdout), done.stderr.splitlines()
 
 
 def wait_for(holds: Callable[[], Any]) -> Any:
@@ -230,14 +247,11 @@ def test_what_listens_where_a_server_was_is_never_asked(tmp_path: Path) -> None:
 
 
 def test_trigger_takes_only_folders_inside_the_archives(place: Path, served: Path) -> None:
-    script = "import sys; from fieldcal.cli.main import run; print([run([*f.split('|')]) for f in sys.argv[1:]])"
-    there = [folder for folder in outside_folders(place).values() if folder.is_dir()]
-    calls = [f"trigger|{folder}|--warehouse|{served}" for folder in there]
+    calls = [["trigger", str(folder)] for folder in outside_folders(place).values() if folder.is_dir()]
     (own,) = [path for path in (place / "archive").glob("sim-1/*") if not path.is_symlink()]
-    calls.append(f"trigger|{own}|--warehouse|{served}|--config|{place / 'elsewhere' / 'fieldcal.toml'}")
-    done = subprocess.run([sys.executable, "-c", script, *calls], env=CLEAN, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == str([2] * len(calls))
-    told = done.stderr.splitlines()
+    calls.append(["trigger", str(own), "--config", str(place / "elsewhere" / "fieldcal.toml")])
+    codes, told = in_one_process([({}, [*call, "--warehouse", str(served)]) for call in calls])
+    assert codes == [2] * len(calls)
     assert len(told) == len(calls)
     assert all("inside the archives that are served" in line and "fieldcal session" in line for line in told[:-1])
     assert "fieldcal serve was started with config" in told[-1]
@@ -313,7 +327,7 @@ def test_an_overwritten_deployment_runs_nothing_of_its_own(place: Path, served: 
     assert not list((served / "tables").rglob("*.parquet"))
 
 
-def test_serve_registers_its_deployments_anew(place: Path, served: Path) -> None:
+def test_serve_registers_its_deployments_anew(place: Path, served: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from prefect.client.orchestration import get_client
 
     from fieldcal.flows.deploy import register
@@ -327,6 +341,7 @@ def test_serve_registers_its_deployments_anew(place: Path, served: Path) -> None
         )
         assert client.read_deployment(found.id).pull_steps == steps
         given = Served(place / "archive", None, served, None, 1)
+        monkeypatch.setenv("DO_NOT_TRACK", "1")
         register(given, "0 3 * * *")
         after = client.read_deployment(found.id)
     assert not after.pull_steps
@@ -334,20 +349,30 @@ def test_serve_registers_its_deployments_anew(place: Path, served: Path) -> None
     assert not after.paused
 
 
-def test_a_stale_secret_is_one_sentence(
-    place: Path, served: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_stale_secret_is_one_sentence(place: Path, served: Path) -> None:
+    """In the file of our own server; in the environment for the user's own; none there."""
     (own,) = [path for path in (place / "archive").glob("sim-1/*") if not path.is_symlink()]
-    for name, value in environment_for(url(served), "fieldcal:of-yesterday").items():
-        monkeypatch.setenv(name, value)
-    assert run(["trigger", str(own), "--warehouse", str(served)]) == 1
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert "does not take the secret that it was shown. Set PREFECT_API_AUTH_STRING" in told
-    assert "of-yesterday" not in told
-    monkeypatch.delenv("PREFECT_API_AUTH_STRING")
-    assert run(["nightly", str(place / "archive"), "--warehouse", str(served)]) == 1
-    assert "asks for a secret. Set PREFECT_API_AUTH_STRING" in capsys.readouterr().err
+    kept, stale = home_of(served, serving=True) / SECRET_FILE, "fieldcal:of-yesterday"
+    right = kept.read_text()
+    kept.write_text(stale)
+    try:
+        calls: list[tuple[dict[str, str], list[str]]] = [
+            ({}, ["trigger", str(own), "--warehouse", str(served)]),
+            (environment_for(url(served), stale), ["trigger", str(own)]),
+            (
+                {**environment_for(url(served)), SECRET: ""},
+                ["nightly", str(place / "archive"), "--warehouse", str(place)],
+            ),
+        ]
+        codes, told = in_one_process(calls)
+    finally:
+        kept.write_text(right)
+    assert codes == [1, 1, 1]
+    assert len(told) == 3
+    assert f"does not take the secret that it was shown. The secret in {kept} is not the one" in told[0]
+    assert "does not take the secret that it was shown. Set PREFECT_API_AUTH_STRING" in told[1]
+    assert "asks for a secret. Set PREFECT_API_AUTH_STRING" in told[2]
+    assert "of-yesterday" not in "".join(told)
 
 
 def test_serve_leaves_nobody_behind_when_it_is_killed(place: Path, served: Path) -> None:
