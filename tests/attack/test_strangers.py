@@ -406,3 +406,17 @@ def parent(pid: int) -> int | None:
     except OSError:
         return None
     return None if state == "Z" else int(ppid)
+
+
+def test_nobody_else_gives_work_to_a_dask_cluster_of_ours() -> None:
+    from distributed import Client, LocalCluster
+
+    from fieldcal.flows.runners import Parallel, _dask
+
+    with LocalCluster(**{**_dask(Parallel(2, "dask")).cluster_kwargs, "n_workers": 0}) as cluster:
+        address = str(cluster.scheduler_address)
+        assert address.startswith("tls://127.0.0.1:")
+        with pytest.raises((OSError, TypeError)):
+            Client(address.replace("tls", "tcp", 1), timeout="2s")
+        with pytest.raises((OSError, TypeError)):
+            Client(address, timeout="2s")
