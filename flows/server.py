@@ -18,7 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -139,10 +139,9 @@ class Server:
         """Take the server that runs, or begin to start one; Prefect, once imported, finds it in the environment."""
         if self.own:
             self._home.mkdir(parents=True, exist_ok=True)
-            self._using = _locked(self._home / USERS, fcntl.LOCK_SH)  # waits while a server is ending
-            self._starting = _locked(
-                self._home / "server.lock", fcntl.LOCK_EX
-            )  # waits while another command starts one
+            # The first waits while a server is ending, the second while another command starts one.
+            self._using = _locked(self._home / USERS, fcntl.LOCK_SH)
+            self._starting = _locked(self._home / "server.lock", fcntl.LOCK_EX)
             running = _recorded(self._home)
             if running is None:
                 self._begin()
@@ -194,9 +193,12 @@ class Server:
 
     def _begin(self) -> None:
         extra = {**EMBEDDED, **(FOR_SERVING if self._serving else FOR_A_COMMAND)}
-        with _port() as port, open(_locked(self._home / LIVES, fcntl.LOCK_EX)) as lives:
+        with ExitStack() as held:
+            port = held.enter_context(_port())
             origin = f"http://127.0.0.1:{port.getsockname()[1]}"
             self._url, self._secret = f"{origin}/api", new_secret(self._home)
+            _replace(self._home / ADDRESS, json.dumps({"url": self._url}))  # before the lock makes it count
+            lives = held.enter_context(open(_locked(self._home / LIVES, fcntl.LOCK_EX)))
             kept = (port.fileno(), lives.fileno())
             with (self._home / "server.log").open("ab") as log:
                 self._process = subprocess.Popen(
