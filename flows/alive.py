@@ -43,13 +43,13 @@ def dead(root: Path) -> list[Path]:
 
 
 def is_held(path: Path) -> bool:
-    """Whether a process holds the lock of this file; one that cannot be opened counts as free."""
+    """Whether a process holds the lock of this file, alone; one that cannot be opened counts as free."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
         return False
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # two who look do not take each other for the holder
     except OSError:
         return True
     finally:

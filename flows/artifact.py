@@ -7,6 +7,7 @@ from pathlib import Path
 
 from fieldcal.batch.documents import LogEntry, NightDocument
 from fieldcal.batch.outcome import verdict_counts
+from fieldcal.flows.connection import answers
 from fieldcal.names import Verdict
 from fieldcal.trends.changes import Change
 
@@ -19,7 +20,10 @@ EVENT = "fieldcal.fleet.changed"
 def keep_artifact(result: NightDocument, root: Path) -> None:
     """Keep the logs that are not `ok` or refused something, under the night's counts. A lost server is no error."""
     from prefect.artifacts import create_table_artifact
+    from prefect.settings import PREFECT_API_URL
 
+    if not answers(str(PREFECT_API_URL.value())):
+        return  # Prefect would try for long
     counts = verdict_counts(result)
     news = [
         {"log": change["vehicle_id"], "what": change["kind"], "why": change["sentence"]} for change in result["changes"]

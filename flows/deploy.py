@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
-from typing import cast
 
-from prefect import flow, serve
-from prefect.deployments.runner import RunnerDeployment
+from prefect import flow
 from prefect.events import DeploymentEventTrigger
+from prefect.exceptions import TerminationSignal
+from prefect.runner import Runner
 from prefect.schedules import Cron
 from prefect.settings import PREFECT_API_URL
 from prefect.types.entrypoint import EntrypointType
 
 from fieldcal.batch.landing import Landing
 from fieldcal.errors import FieldcalError
-from fieldcal.flows.nightly import nightly, session
+from fieldcal.flows.served import Served, served_landed, served_nightly, served_session
 from fieldcal.flows.trigger import DEPLOYMENT, EVENT, trigger
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.words.talk import say
@@ -37,38 +39,36 @@ def session_landed(folder: str) -> str:
     return str(trigger(url, Path(folder).absolute())["flow_run_id"])
 
 
-def deployments(
-    archive: Path, root: Path, config: Path | None, cron: str, workers: int, timezone: str | None = None
-) -> list[RunnerDeployment]:
-    """The three deployments. Parameters name absolute paths, so that they hold wherever they run on this machine."""
-    common: dict[str, str | int | None] = {
-        "warehouse": str(root.absolute()),
-        "config": str(config.absolute()) if config else None,
-        "workers": workers,
-    }
+def register(served: Served, cron: str, timezone: str | None = None) -> Runner:
+    """Register the three deployments anew, as they are meant, and give what runs them.
+
+    The runner holds the flows themselves. It runs a deployment that somebody has overwritten as it was registered, and
+    no step to pull code from anywhere.
+
+    Raises
+    ------
+    ValueError
+        `cron` or `timezone` is none.
+    """
+    runner = Runner(pause_on_shutdown=False, limit=AT_ONCE)
     landed = DeploymentEventTrigger(
         name=EVENT, expect={EVENT}, parameters={"folder": "{{ event.payload.folder }}"}, enabled=True
     )
     module = EntrypointType.MODULE_PATH
-    found = [
-        nightly.to_deployment(
-            DEPLOYMENT,
-            schedule=Cron(cron, timezone=timezone or local_timezone()),
-            parameters={"archive": str(archive.absolute()), **common},
-            entrypoint_type=module,
-        ),
-        session.to_deployment(DEPLOYMENT, parameters=common, entrypoint_type=module),
-        session_landed.to_deployment(DEPLOYMENT, triggers=[landed], entrypoint_type=module),
-    ]
-    # A coroutine is what these are only where an event loop runs, which no command has.
-    return cast(list[RunnerDeployment], found)
+    given = served.parameters()
+    schedule = Cron(cron, timezone=timezone or local_timezone())
+    runner.add_flow(served_nightly(served), DEPLOYMENT, schedule=schedule, parameters=given, entrypoint_type=module)
+    runner.add_flow(served_session(served), DEPLOYMENT, parameters=given, entrypoint_type=module)
+    runner.add_flow(served_landed(served), DEPLOYMENT, triggers=[landed], entrypoint_type=module)
+    return runner
 
 
-def host(hosted: list[RunnerDeployment], url: str, watched: Path | None, quiet_s: float) -> None:
+def host(runner: Runner, url: str, watched: Path | None, quiet_s: float) -> None:
     """Host deployments until interrupted; with `watched`, trigger its sessions when they have stopped growing."""
     if watched is not None:
         threading.Thread(target=_watch, args=(watched, url, quiet_s), daemon=True).start()
-    serve(*hosted, pause_on_shutdown=False, print_starting_message=False, limit=AT_ONCE)
+    with suppress(KeyboardInterrupt, TerminationSignal):
+        asyncio.run(runner.start())
 
 
 def local_timezone() -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -19,10 +19,11 @@ from fieldcal.config.find import Source
 from fieldcal.flight.job import PlainJob
 from fieldcal.flows.alive import alive
 from fieldcal.flows.artifact import keep_artifact, tell_prefect
+from fieldcal.flows.farewell import tell_while_heard
 from fieldcal.flows.pool import hand_over, pool_answers
 from fieldcal.flows.processes import process_answers, spawned
 from fieldcal.flows.runners import Answers, Parallel, batches, dask_answers
-from fieldcal.flows.tasks import run_batch, run_publish, unseen
+from fieldcal.flows.tasks import publish_as_task, run_batch
 from fieldcal.provenance.run_key import code_digest
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse.errors import WarehouseError
@@ -89,13 +90,22 @@ def batch(
 
 
 def flow_of(
-    night: Night, parallel: Parallel, watcher: Watcher | None, processes: ProcessPoolExecutor | None
+    night: Night,
+    parallel: Parallel,
+    watcher: Watcher | None,
+    processes: ProcessPoolExecutor | None,
+    keep: Callable[[NightDocument], None],
 ) -> Flow[..., NightDocument]:
-    """The flow of a night that was planned already, while the server started; `processes` wait for its batches."""
+    """The flow of a night that was planned already, while the server started; `processes` wait for its batches.
+
+    `keep` gets the result too: the flow itself fails if Prefect cannot tell its server that it has ended.
+    """
 
     @flow(name="nightly" if night.session is None else "session", persist_result=False, validate_parameters=False)
     def planned(folder: str, warehouse: str, workers: int, runner: str) -> NightDocument:
-        return carry_out(night, parallel, watcher, processes)
+        result = carry_out(night, parallel, watcher, processes)
+        keep(result)
+        return result
 
     return planned
 
@@ -107,6 +117,7 @@ def carry_out(
     processes: ProcessPoolExecutor | None = None,
 ) -> NightDocument:
     """Run what the plan says, within a flow run; the JSON of the night."""
+    tell_while_heard()
     with alive(night.root):
         if watcher is not None:
             watcher.planned(len(night.plan.jobs), len(night.plan.missing))
@@ -117,7 +128,7 @@ def carry_out(
                 watcher.done(outcome)
         outcomes += _calibrate(night, parallel, watcher, processes)
         for publishing in publishings(night, outcomes):
-            run_publish(publishing.vehicle_id, unseen(publishing))
+            publish_as_task(publishing)
         closing = close_night(night.root, night.configuration.alerts)
         result = night.document(outcomes, closing)
         keep_artifact(result, night.root)
@@ -153,7 +164,7 @@ def _answers(parallel: Parallel, inputs: list[Batch], processes: ProcessPoolExec
         return pool_answers(inputs)
     if parallel.runner == "dask":
         return dask_answers(parallel, run_batch, inputs)
-    return process_answers(processes or spawned(parallel.workers), inputs)
+    return process_answers(parallel.workers, inputs, processes)
 
 
 def _outcomes(answer: Answer) -> Iterator[Outcome]:

@@ -6,13 +6,16 @@ process tells Prefect's server of its tasks itself: through this one every event
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module
 from multiprocessing import get_context
 from typing import Any
 
 from fieldcal.batch.documents import Answer, Batch
+from fieldcal.batch.flights import flights
+from fieldcal.flows.farewell import end_with_parent, tell_while_heard
 from fieldcal.flows.runners import Answers, answer_of
 
 LISTEN_S = 0.25
@@ -21,8 +24,8 @@ Context = dict[str, Any]
 
 
 def spawned(workers: int) -> ProcessPoolExecutor:
-    """Processes that inherit nothing of this one."""
-    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+    """Processes that inherit nothing of this one, and end with it."""
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=end_with_parent)
 
 
 def spawned_ahead(workers: int) -> ProcessPoolExecutor:
@@ -33,17 +36,41 @@ def spawned_ahead(workers: int) -> ProcessPoolExecutor:
     return pool
 
 
-def process_answers(pool: ProcessPoolExecutor, inputs: Sequence[Batch]) -> Answers:
-    """Run the batches; call it within the flow run that their tasks belong to."""
+def process_answers(workers: int, inputs: Sequence[Batch], ahead: ProcessPoolExecutor | None = None) -> Answers:
+    """Run the batches; call it within the flow run that their tasks belong to.
+
+    A process that is killed takes all batches of its pool with it, not only its own, and there is no saying which that
+    was. They run in a second pool; those that were in it too when it broke come back as errors.
+    """
     context = _context()
+    lost = yield from _answers(ahead or spawned(workers), context, inputs)
+    if lost:
+        lost = yield from _answers(spawned(workers), context, [given for given, _ in lost])
+    yield from lost
+
+
+def _answers(
+    pool: ProcessPoolExecutor, context: Context, inputs: Sequence[Batch]
+) -> Generator[tuple[Batch, Answer | Exception], None, list[tuple[Batch, Exception]]]:
+    """The answers of one pool; returns the batches that it lost because it broke."""
+    lost: list[tuple[Batch, Exception]] = []
     with pool:
         waiting: dict[Future[Answer], Batch] = {}
-        waiting |= {pool.submit(_batch, context, given): given for given in inputs}
+        for given in inputs:
+            try:
+                waiting[pool.submit(_batch, context, given)] = given
+            except BrokenProcessPool as error:
+                lost.append((given, error))
         while waiting:
             # A wait without end would not hear Ctrl-C.
             for future in wait(waiting, LISTEN_S, FIRST_COMPLETED).done:
-                yield waiting.pop(future), answer_of(future)
+                given, answer = waiting.pop(future), answer_of(future)
+                if isinstance(answer, BrokenProcessPool):
+                    lost.append((given, answer))
+                else:
+                    yield given, answer
         pool.shutdown(wait=False)  # they tell Prefect the rest while the night publishes
+    return lost
 
 
 def _context() -> Context:
@@ -60,7 +87,7 @@ def _import() -> None:
 
 
 def _batch(context: Context, given: Batch) -> Answer:
-    """One batch, in one of the processes."""
+    """One batch, in one of the processes; where Prefect itself fails, without it."""
     from prefect.context import hydrated_context
 
     from fieldcal.flows import nightly
@@ -68,5 +95,9 @@ def _batch(context: Context, given: Batch) -> Answer:
 
     run = context["flow_run_context"]
     flow = {known.name: known for known in (nightly.nightly, nightly.session)}[run["flow"]]
-    with hydrated_context({**context, "flow_run_context": {**run, "flow": flow}}):
-        return run_batch(**given)
+    try:
+        with hydrated_context({**context, "flow_run_context": {**run, "flow": flow}}):
+            tell_while_heard()
+            return run_batch(**given)
+    except Exception:
+        return flights(given["root"], given["source"], given["jobs"], given["code"])

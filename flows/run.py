@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, cast
 
 from fieldcal.batch.documents import NightDocument, PlanDocument, PlannedLog, UnreadEntry
 from fieldcal.config.find import configuration_of, find_source
+from fieldcal.flows.connection import connected
 from fieldcal.flows.server import running_server
 from fieldcal.warehouse.layout import prepare
+from fieldcal.words.talk import say
 
 if TYPE_CHECKING:
     from fieldcal.batch.night import Watcher
@@ -37,8 +39,6 @@ def run_night(
     runner, scheduler = where.get("runner") or "process", where.get("scheduler")
     with running_server(root) as server:
         starting = time.monotonic()
-        from prefect.settings import PREFECT_API_URL, temporary_settings
-
         from fieldcal.batch.night import plan_night
         from fieldcal.flows.housekeeping import tidy_prefect
         from fieldcal.flows.nightly import flow_of
@@ -54,9 +54,17 @@ def run_night(
             url = server.wait()
             start_s = imported - starting + time.monotonic() - waiting
             tidy_prefect(root, url, own_server=server.own)
-            with temporary_settings({PREFECT_API_URL: url}):
-                planned = flow_of(night, parallel, progress, processes)
-                result = planned(str(session or archive), str(root), workers, runner)
+            with connected(url):
+                kept: list[NightDocument] = []
+                planned = flow_of(night, parallel, progress, processes, kept.append)
+                try:
+                    result = planned(str(session or archive), str(root), workers, runner)
+                except Exception as error:
+                    if not kept:
+                        raise
+                    result = kept[0]
+                    why = type(error).__name__
+                    say(f"Prefect's server was lost ({why}): the night is whole, Prefect's record of it is not.")
     told: dict[str, object] = dict(result)
     logs = told.pop("logs")
     told |= {"seconds": round(time.monotonic() - began, 3), "server_seconds": round(start_s, 3)}

@@ -103,7 +103,9 @@ def _dask(parallel: Parallel) -> DaskTaskRunner:
     except ImportError as error:
         raise FieldcalError(ReasonCode.NO_DASK, 'Dask is not installed: pip install "fieldcal[dask]".') from error
     if parallel.scheduler is None:
-        return DaskTaskRunner(cluster_kwargs={"n_workers": parallel.workers, "threads_per_worker": 1})
+        # Whoever reaches a scheduler has its workers run what he likes: with keys of its own only this process does.
+        closed = {"security": True, "dashboard_address": None}
+        return DaskTaskRunner(cluster_kwargs={"n_workers": parallel.workers, "threads_per_worker": 1, **closed})
     try:
         Client(parallel.scheduler, timeout="10s").close()  # type: ignore[no-untyped-call]
     except (OSError, TimeoutError, ValueError) as error:

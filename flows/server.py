@@ -3,6 +3,10 @@
 Every command holds a lock of the operating system while it uses the server, and the server ends when nobody does, so
 a killed command leaves nothing behind. With `PREFECT_API_URL` set that server is used and none is started. Prefect must
 not be imported before `prepare_environment`.
+
+Whoever can ask the server can have commands run, so it lets in only those who know its secret, a new one for every
+server. The secret is shown to nobody else: the port is taken before anybody is told of it and belongs to the server
+until it ends, and an address that was recorded counts only while the server holds a lock that ends with it.
 """
 
 from __future__ import annotations
@@ -13,10 +17,8 @@ import socket
 import subprocess
 import sys
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -24,20 +26,36 @@ from typing import Self
 import fieldcal
 from fieldcal.errors import FieldcalError
 from fieldcal.file_locks import fcntl
+from fieldcal.flows.alive import is_held
+from fieldcal.flows.connection import (
+    ANSWER_TIMEOUT_S,
+    OF_THE_USER,
+    SECRET,
+    URL,
+    answers,
+    environment_for,
+    kept_secret,
+    need_entry,
+    new_secret,
+    no_answer,
+    of_ours,
+)
 from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
 
 START_TIMEOUT_S = 180.0
-ANSWER_TIMEOUT_S = 5.0
 USERS = "server.users"
+LIVES = "server.lives"
 ADDRESS = "server.json"
 
 QUIET = {
     "DO_NOT_TRACK": "1",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "PREFECT_LOGGING_LEVEL": "CRITICAL",
+    "PREFECT_INTERNAL_LOGGING_LEVEL": "CRITICAL",
     "PREFECT_LOGGING_TO_API_ENABLED": "false",
     "PREFECT_CLI_PROMPT": "false",
+    "PREFECT_CLIENT_MAX_RETRIES": "1",  # with a server that was killed every request waits for all of them, in vain
     "PREFECT_RESULTS_DEFAULT_SERIALIZER": "json",
     "PREFECT_SERVER_ALLOW_EPHEMERAL_MODE": "false",
 }
@@ -54,7 +72,13 @@ FOR_A_COMMAND = {
     "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_ENABLED": "false",
     "PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED": "false",
 }
-FOR_SERVING = {"PREFECT_SERVER_SERVICES_DB_VACUUM_ENABLED": "events,flow_runs"}
+# Events are three quarters of the database, and over once their triggers have heard them.
+FOR_SERVING = {
+    "PREFECT_SERVER_SERVICES_DB_VACUUM_ENABLED": "events,flow_runs",
+    "PREFECT_SERVER_EVENTS_RETENTION_PERIOD": "P1D",
+}
+# Not even the user's own settings open the server to pages of other origins.
+CLOSED = {"PREFECT_SERVER_API_CSRF_PROTECTION_ENABLED": "true"}
 
 
 def prepare_environment(root: Path, *, serving: bool = False) -> None:
@@ -75,8 +99,13 @@ def home_of(root: Path, *, serving: bool) -> Path:
 
 
 def serving_address(root: Path) -> str | None:
-    """Address of the server that `fieldcal serve` started for this root; None when none is recorded."""
+    """Address of the server that `fieldcal serve` started for this root; None when none lives."""
     return _recorded(home_of(root, serving=True))
+
+
+def has_served(root: Path) -> bool:
+    """Whether `fieldcal serve` ever started a server for this root."""
+    return (home_of(root, serving=True) / ADDRESS).exists()
 
 
 class Server:
@@ -91,27 +120,36 @@ class Server:
     """
 
     def __init__(self, home: Path, *, serving: bool = False) -> None:
-        self.own = not os.environ.get("PREFECT_API_URL")
-        self._url = os.environ.get("PREFECT_API_URL", "")
+        self.own = not os.environ.get(URL)
+        self._url = os.environ.get(URL, "")
+        self._secret = os.environ.get(SECRET)
         self._home = home.resolve()
         self._serving = serving
         self._process: subprocess.Popen[bytes] | None = None
         self._using: int | None = None
         self._starting: int | None = None
+        self._former: dict[str, str | None] = {}
+
+    @property
+    def home(self) -> Path:
+        """Folder of the server's files."""
+        return self._home
 
     def start(self) -> None:
         """Take the server that runs, or begin to start one; Prefect, once imported, finds it in the environment."""
-        if not self.own:
-            return
-        self._home.mkdir(parents=True, exist_ok=True)
-        self._using = _locked(self._home / USERS, fcntl.LOCK_SH)  # waits while a server is ending
-        self._starting = _locked(self._home / "server.lock", fcntl.LOCK_EX)  # waits while another command starts one
-        running = _recorded(self._home)
-        if running is not None and answers(running):
-            self._url = running
-        else:
-            self._begin()
-        os.environ["PREFECT_API_URL"] = self._url
+        if self.own:
+            self._home.mkdir(parents=True, exist_ok=True)
+            # The first waits while a server is ending, the second while another command starts one.
+            self._using = _locked(self._home / USERS, fcntl.LOCK_SH)
+            self._starting = _locked(self._home / "server.lock", fcntl.LOCK_EX)
+            running = _recorded(self._home)
+            if running is None:
+                self._begin()
+            else:
+                self._url, self._secret = running, kept_secret(self._home)
+        ours = environment_for(self._url, self._secret)
+        self._former = {name: os.environ.get(name) for name in ours}
+        os.environ.update(ours)
 
     def wait(self) -> str:
         """Wait until the server answers; its address.
@@ -119,11 +157,11 @@ class Server:
         Raises
         ------
         FieldcalError
-            `prefect_unavailable`.
+            `prefect_unavailable`, `wrong_secret`.
         """
         give_up = time.monotonic() + (START_TIMEOUT_S if self.own else ANSWER_TIMEOUT_S)
         while not answers(self._url):
-            if self._process is not None and self._process.poll() is not None:
+            if self.own and not is_held(self._home / LIVES):
                 raise FieldcalError(
                     ReasonCode.PREFECT_UNAVAILABLE,
                     f"The Prefect server could not start; see {self._home / 'server.log'}.",
@@ -131,21 +169,22 @@ class Server:
             if time.monotonic() > give_up:
                 raise FieldcalError(ReasonCode.PREFECT_UNAVAILABLE, self._silence())
             time.sleep(0.05)
-        if self._process is not None:
-            record = {"url": self._url, "pid": self._process.pid}
-            _replace(self._home / ADDRESS, json.dumps(record))
+        need_entry(self._url, of_ours(self._home) if self.own else OF_THE_USER)
         self._release_start()
         return self._url
 
     def stop(self) -> None:
         """Use it no longer. A server of ours ends by itself when nobody does."""
-        if not self.own:
-            return
         self._release_start()
         if self._using is not None:
             os.close(self._using)
             self._using = None
-        os.environ.pop("PREFECT_API_URL", None)
+        for name, value in self._former.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+        self._former = {}
 
     def _release_start(self) -> None:
         if self._starting is not None:
@@ -153,33 +192,43 @@ class Server:
             self._starting = None
 
     def _begin(self) -> None:
-        port = _free_port()
-        self._url = f"http://127.0.0.1:{port}/api"
         extra = {**EMBEDDED, **(FOR_SERVING if self._serving else FOR_A_COMMAND)}
-        with (self._home / "server.log").open("ab") as log:
-            self._process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-P",
-                    "-m",
-                    "fieldcal.flows.server_process",
-                    str(port),
-                    str(self._home / USERS),
-                    *self._kind(),
-                ],
-                cwd=self._home,  # Prefect's migrations put the current folder on the path, whatever lies there
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env={
-                    **os.environ,
-                    **{name: os.environ.get(name, value) for name, value in extra.items()},
-                    "PREFECT_API_URL": self._url,
-                    "PREFECT_HOME": str(self._home),
-                    "PYTHONPATH": _python_path(),
-                },
-                start_new_session=True,
-            )
+        with ExitStack() as held:
+            port = held.enter_context(_port())
+            origin = f"http://127.0.0.1:{port.getsockname()[1]}"
+            self._url, self._secret = f"{origin}/api", new_secret(self._home)
+            _replace(self._home / ADDRESS, json.dumps({"url": self._url}))  # before the lock makes it count
+            lives = held.enter_context(open(_locked(self._home / LIVES, fcntl.LOCK_EX)))
+            kept = (port.fileno(), lives.fileno())
+            with (self._home / "server.log").open("ab") as log:
+                self._process = subprocess.Popen(
+                    [
+                        sys.executable,
+                        "-P",
+                        "-m",
+                        "fieldcal.flows.server_process",
+                        str(port.fileno()),
+                        str(self._home / USERS),
+                        *self._kind(),
+                    ],
+                    cwd=self._home,  # Prefect's migrations put the current folder on the path, whatever lies there
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    env={
+                        **os.environ,
+                        **{name: os.environ.get(name, value) for name, value in extra.items()},
+                        **environment_for(self._url, self._secret),
+                        **CLOSED,
+                        "PREFECT_SERVER_API_CORS_ALLOWED_ORIGINS": origin,
+                        "PREFECT_SERVER_API_AUTH_STRING": self._secret,
+                        "PREFECT_HOME": str(self._home),
+                        "PYTHONPATH": _python_path(),
+                    },
+                    pass_fds=kept,  # the port, and the lock that says the server lives
+                    start_new_session=True,
+                )
+        _replace(self._home / ADDRESS, json.dumps({"url": self._url, "pid": self._process.pid}))
 
     def _kind(self) -> list[str]:
         return ["serving"] if self._serving else []
@@ -207,25 +256,10 @@ def running_server(root: Path, *, serving: bool = False) -> Iterator[Server]:
         yield server
 
 
-def answers(url: str) -> bool:
-    """Whether a Prefect server answers at an API address."""
-    try:
-        with urllib.request.urlopen(f"{url}/health", timeout=ANSWER_TIMEOUT_S) as answer:
-            return bool(answer.status == 200)
-    except (OSError, ValueError, urllib.error.URLError):
-        return False
-
-
-def no_answer(url: str) -> str:
-    """What to say of a server of the user's own that does not answer."""
-    return (
-        f"No Prefect server answers at PREFECT_API_URL={url}. Start it (`prefect server start`), or unset "
-        "PREFECT_API_URL to use the one that comes with fieldcal."
-    )
-
-
 def _recorded(home: Path) -> str | None:
-    """Address of the server that was last started there."""
+    """Address of the server that runs for `home`; None when none lives, whoever may be at its port now."""
+    if not is_held(home / LIVES):
+        return None
     try:
         found: Json = json.loads((home / ADDRESS).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -245,11 +279,11 @@ def _locked(path: Path, how: int) -> int:
     return descriptor
 
 
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+def _port() -> socket.socket:
+    """A port of 127.0.0.1 that is taken from now on; nobody is listening yet."""
+    port = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    port.bind(("127.0.0.1", 0))
+    return port
 
 
 def _python_path() -> str:

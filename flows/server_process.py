@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -15,11 +16,13 @@ UNUSED_S = 2.0
 GRACE_S = 10.0
 
 
-def main(port: int, users: str, *, serving: bool) -> None:
+def main(port: socket.socket, users: str, *, serving: bool) -> None:
     """Serve until nobody has used the server for `UNUSED_S`, the time it needs to write its last records.
 
     Parameters
     ----------
+    port : socket
+        Bound to 127.0.0.1 by who started this process.
     users : str
         File on which every user holds a shared lock.
     serving : bool
@@ -30,7 +33,8 @@ def main(port: int, users: str, *, serving: bool) -> None:
     from prefect.server.api.server import create_app
 
     app = create_app(ephemeral=not serving, final=True)
-    uvicorn.run(app, host="127.0.0.1", port=port, log_level="error", lifespan="on", timeout_graceful_shutdown=2)
+    settings = uvicorn.Config(app, log_level="error", lifespan="on", timeout_graceful_shutdown=2)
+    uvicorn.Server(settings).run(sockets=[port])
 
 
 def _end_when_unused(users: str) -> None:
@@ -53,4 +57,4 @@ def _end_when_unused(users: str) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), sys.argv[2], serving="serving" in sys.argv[3:])
+    main(socket.socket(fileno=int(sys.argv[1])), sys.argv[2], serving="serving" in sys.argv[3:])

@@ -66,3 +66,13 @@ def step_as_task(work: FlightWork, step: str) -> None:
     except Exception:
         if step not in work.records:
             work.do(step)
+
+
+def publish_as_task(publishing: Publishing) -> None:
+    """The publishing of a vehicle as a Prefect task; where Prefect itself fails, without it."""
+    try:
+        run_publish(publishing.vehicle_id, unseen(publishing))
+    except WarehouseError:
+        raise
+    except Exception:
+        publishing.publish()  # what was published already stays as it is

@@ -20,7 +20,8 @@ from fieldcal.config.find import configuration_of, find_source
 from fieldcal.errors import FieldcalError
 from fieldcal.flows.alive import FOLDER as RUNNING
 from fieldcal.flows.alive import dead, is_held
-from fieldcal.flows.server import answers, no_answer, serving_address
+from fieldcal.flows.connection import answers, no_answer
+from fieldcal.flows.server import has_served, serving_address
 from fieldcal.logs import find_logs
 from fieldcal.logs.unread import find_unread, told
 
@@ -171,11 +172,11 @@ def _server(root: Path) -> Check:
             return Check("server", OK, f"PREFECT_API_URL={own} answers")
         return Check("server", FAILED, f"PREFECT_API_URL={own} does not answer", no_answer(own))
     serving = serving_address(root)
-    if serving is None:
-        return Check("server", OK, "none is configured; every night starts one of its own on 127.0.0.1")
-    if answers(serving):
+    if serving is not None and answers(serving):
         return Check("server", OK, f"fieldcal serve answers at {serving}")
-    return Check("server", WARNING, f"fieldcal serve is not running ({serving})", "Start it again: fieldcal serve.")
+    if has_served(root):
+        return Check("server", WARNING, "fieldcal serve is not running", "Start it again: fieldcal serve.")
+    return Check("server", OK, "none is configured; every night starts one of its own on 127.0.0.1")
 
 
 def _nearest(path: Path) -> Path:

@@ -42,6 +42,7 @@ def serve(
     """
     from fieldcal.config.find import find_source
     from fieldcal.errors import FieldcalError
+    from fieldcal.flows.connection import SECRET_FILE
     from fieldcal.flows.server import running_server
     from fieldcal.warehouse import Warehouse
     from fieldcal.warehouse.layout import prepare
@@ -56,19 +57,23 @@ def serve(
     prepare(root)
     os.environ.setdefault("PREFECT_RUNNER_POLL_FREQUENCY", "2")
     with running_server(root, serving=True) as server:
-        from fieldcal.flows.deploy import deployments, host, local_timezone
-        from fieldcal.flows.housekeeping import tidy_prefect
+        from fieldcal.flows.deploy import host, local_timezone, register
+        from fieldcal.flows.housekeeping import keep_tidy, tidy_prefect
+        from fieldcal.flows.served import Served
 
         url = server.wait()
         tidy_prefect(root, url, own_server=server.own)
         try:
-            hosted = deployments(place, root, config, cron, workers, timezone)
+            runner = register(Served(place, watch, root, config, workers), cron, timezone)
         except ValueError as error:
             raise FieldcalError(ReasonCode.WRONG_OPTION, f'--cron "{cron}", --timezone: {_last_line(error)}') from error
         when = f'"{cron}" ({timezone or local_timezone()})'
         say(f"Serving at {url}: nightly over {place.absolute()} at {when}, into {root}")
         say("Sessions: fieldcal trigger SESSION_DIR" + (f", and by themselves in {watch}" if watch else ""))
-        host(hosted, url, watch.absolute() if watch else None, quiet)
+        if server.own:
+            keep_tidy(root, url)
+            say(f"The server's secret, for those who emit events or open its pages: {server.home / SECRET_FILE}")
+        host(runner, url, watch.absolute() if watch else None, quiet)
     return 0
 
 
@@ -89,7 +94,6 @@ def trigger(
     """
     from fieldcal.cli.show import print_json
     from fieldcal.errors import FieldcalError
-    from fieldcal.flows.server import prepare_environment
     from fieldcal.flows.trigger import server_address
     from fieldcal.flows.trigger import trigger as ask
     from fieldcal.warehouse import Warehouse
@@ -98,7 +102,6 @@ def trigger(
         raise FieldcalError(ReasonCode.NO_SESSION, f"There is no session folder at {folder}.")
     root = Warehouse(warehouse).root
     url = server_address(root)
-    prepare_environment(root, serving=True)
     changes = {"warehouse": warehouse, "config": config}
     asked = ask(url, folder.absolute(), **{name: str(path.absolute()) for name, path in changes.items() if path})
     if as_json:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -16,7 +17,8 @@ from uuid import uuid4
 import pytest
 
 from fieldcal.batch.landing import Landing
-from fieldcal.flows.server import serving_address
+from fieldcal.flows.connection import connected, kept_secret
+from fieldcal.flows.server import home_of, serving_address
 from fieldcal.flows.trigger import EVENT, session_digest
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
@@ -58,7 +60,7 @@ def served(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     assert process.stderr is not None
     assert process.stderr.readline().startswith("Serving at http://127.0.0.1:")
     assert "fieldcal trigger" in process.stderr.readline()
-    wait_for(lambda: len(deployed(str(serving_address(root)))) == 3)
+    wait_for(lambda: len(deployed(root)) == 3)
     yield root
     process.send_signal(signal.SIGINT)
     process.wait(timeout=10)
@@ -76,21 +78,26 @@ def vehicles(root: Path) -> set[str]:
     return set(Warehouse(root).scan("calibration").collect()["vehicle_id"])
 
 
-def deployed(url: str) -> list[Any]:
-    from prefect.client.orchestration import get_client
-    from prefect.settings import PREFECT_API_URL, temporary_settings
+def inside(root: Path) -> AbstractContextManager[None]:
+    """With the secret of the server that is served for this root."""
+    url = serving_address(root)
+    assert url is not None
+    return connected(url, kept_secret(home_of(root, serving=True)))
 
-    with temporary_settings({PREFECT_API_URL: url}), get_client(sync_client=True) as client:
+
+def deployed(root: Path) -> list[Any]:
+    from prefect.client.orchestration import get_client
+
+    with inside(root), get_client(sync_client=True) as client:
         return list(client.read_deployments())
 
 
-def runs(url: str, flow: str) -> list[Any]:
+def runs(root: Path, flow: str) -> list[Any]:
     from prefect.client.orchestration import get_client
     from prefect.client.schemas.filters import FlowFilter, FlowFilterName
-    from prefect.settings import PREFECT_API_URL, temporary_settings
 
     named = FlowFilter(name=FlowFilterName(any_=[flow]))
-    with temporary_settings({PREFECT_API_URL: url}), get_client(sync_client=True) as client:
+    with inside(root), get_client(sync_client=True) as client:
         return list(client.read_flow_runs(flow_filter=named))
 
 
@@ -107,13 +114,10 @@ def test_a_triggered_session_is_in_the_history_and_runs_once(archive: Path, serv
 
 def test_an_event_does_the_same_once_however_often_it_comes(archive: Path, served: Path) -> None:
     from prefect.client.orchestration import get_client
-    from prefect.settings import PREFECT_API_URL, temporary_settings
 
     folder = sessions(archive)[1]
-    url = serving_address(served)
-    assert url is not None
-    before = len(runs(url, "session"))
-    with temporary_settings({PREFECT_API_URL: url}), get_client(sync_client=True) as client:
+    before = len(runs(served, "session"))
+    with inside(served), get_client(sync_client=True) as client:
         for _ in range(2):
             event = {
                 "occurred": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -124,14 +128,12 @@ def test_an_event_does_the_same_once_however_often_it_comes(archive: Path, serve
             }
             client._client.post("/events", json=[event]).raise_for_status()
     wait_for(lambda: "sim-2" in vehicles(served))
-    wait_for(lambda: sum(run.state.is_final() for run in runs(url, "session-landed")) == 2)
-    assert len(runs(url, "session")) == before + 1
+    wait_for(lambda: sum(run.state.is_final() for run in runs(served, "session-landed")) == 2)
+    assert len(runs(served, "session")) == before + 1
 
 
 def test_the_night_is_scheduled(served: Path) -> None:
-    url = serving_address(served)
-    assert url is not None
-    upcoming = wait_for(lambda: runs(url, "nightly"))
+    upcoming = wait_for(lambda: runs(served, "nightly"))
     assert all(run.auto_scheduled and run.expected_start_time.hour == 3 for run in upcoming)
 
 

@@ -16,6 +16,7 @@ from distributed import LocalCluster
 from fieldcal.batch.steps import STEPS
 from fieldcal.errors import FieldcalError
 from fieldcal.flight.job import Job
+from fieldcal.flows.connection import connected
 from fieldcal.flows.pool import hand_over
 from fieldcal.flows.run import run_night
 from fieldcal.flows.runners import LARGEST_BATCH, Parallel, batches
@@ -78,10 +79,9 @@ def tasks_of_runs(url: str) -> dict[str, Counter[str]]:
     """How many completed tasks of each kind the server knows, by flow run."""
     from prefect.client.orchestration import get_client
     from prefect.client.schemas.filters import TaskRunFilter, TaskRunFilterFlowRunId
-    from prefect.settings import PREFECT_API_URL, temporary_settings
 
     found: dict[str, Counter[str]] = {}
-    with temporary_settings({PREFECT_API_URL: url}), get_client(sync_client=True) as client:
+    with connected(url), get_client(sync_client=True) as client:
         for run in client.read_flow_runs():
             of_run = TaskRunFilter(flow_run_id=TaskRunFilterFlowRunId(any_=[run.id]))
             tasks = client.read_task_runs(task_run_filter=of_run)

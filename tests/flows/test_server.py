@@ -18,8 +18,9 @@ import pytest
 from fieldcal.errors import FieldcalError
 from fieldcal.flows import housekeeping
 from fieldcal.flows.alive import FOLDER, dead
+from fieldcal.flows.connection import answers, connected
 from fieldcal.flows.run import run_night
-from fieldcal.flows.server import Server, answers, prepare_environment
+from fieldcal.flows.server import Server, prepare_environment
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 
@@ -107,9 +108,8 @@ def test_nothing_is_sent_to_others() -> None:
 
 def flow_runs(url: str) -> dict[str, str]:
     from prefect.client.orchestration import get_client
-    from prefect.settings import PREFECT_API_URL, temporary_settings
 
-    with temporary_settings({PREFECT_API_URL: url}), get_client(sync_client=True) as client:
+    with connected(url), get_client(sync_client=True) as client:
         return {str(run.id): str(run.state_type.value) for run in client.read_flow_runs() if run.state_type}
 
 
@@ -138,12 +138,11 @@ def test_a_killed_run_is_ended_at_the_next_start(archive: Path, tmp_path: Path, 
     assert list((root / FOLDER).iterdir()) == []
 
 
-def test_old_runs_are_removed_with_their_tasks(
+def test_old_runs_and_all_beyond_many_are_removed_with_their_tasks(
     archive: Path, tmp_path: Path, prefect_server: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from prefect.client.orchestration import get_client
     from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId, TaskRunFilter, TaskRunFilterFlowRunId
-    from prefect.settings import PREFECT_API_URL, temporary_settings
 
     before = set(flow_runs(prefect_server))
     run_night(archive, tmp_path / "warehouse")
@@ -151,7 +150,7 @@ def test_old_runs_are_removed_with_their_tasks(
 
     def tasks() -> int:
         of_run = TaskRunFilter(flow_run_id=TaskRunFilterFlowRunId(any_=[UUID(own)]))
-        with temporary_settings({PREFECT_API_URL: prefect_server}), get_client(sync_client=True) as client:
+        with connected(prefect_server), get_client(sync_client=True) as client:
             return len(client.read_task_runs(task_run_filter=of_run))
 
     give_up = time.monotonic() + 20
@@ -162,10 +161,9 @@ def test_old_runs_are_removed_with_their_tasks(
     assert own in flow_runs(prefect_server)
 
     real = housekeeping._ended_before
-    only_own = FlowRunFilterId(any_=[UUID(own)])
 
     def narrowed(days: float) -> FlowRunFilter:
-        return FlowRunFilter(id=only_own, end_time=real(days).end_time)
+        return FlowRunFilter(id=FlowRunFilterId(any_=[UUID(own)]), end_time=real(days).end_time)
 
     monkeypatch.setattr(housekeeping, "_ended_before", narrowed)
     monkeypatch.setattr(housekeeping, "KEPT_DAYS", 0)
@@ -173,6 +171,15 @@ def test_old_runs_are_removed_with_their_tasks(
     housekeeping.tidy_prefect(tmp_path, prefect_server, own_server=True)
     assert own not in flow_runs(prefect_server)
     assert tasks() == 0
+
+    monkeypatch.setattr(housekeeping, "KEPT_DAYS", 30)
+    run_night(archive, tmp_path / "warehouse")
+    (own,) = set(flow_runs(prefect_server)) - before
+    housekeeping.tidy_prefect(tmp_path, prefect_server, own_server=True)
+    assert own in flow_runs(prefect_server)
+    monkeypatch.setattr(housekeeping, "MOST_RUNS", 0)
+    housekeeping.tidy_prefect(tmp_path, prefect_server, own_server=True)
+    assert own not in flow_runs(prefect_server)
 
 
 class Planted:

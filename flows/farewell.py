@@ -1,0 +1,39 @@
+"""Processes end in time: a worker with the process that started it, and none waits for a server that is gone.
+
+Prefect tells its server of every task from a queue, and at exit waits until all has been told: for ever, if nobody
+listens any more. Its records are worth an attempt, not a night.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+
+ATTEMPTS = 3
+"""Before each one more than these Prefect waits for a second."""
+
+
+def end_with_parent() -> None:
+    """End this process, at once, when the one that started it is gone, killed say; whatever is on disk is whole."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def tell_while_heard() -> None:
+    """From now on, in this process, Prefect tries each event of a server that was lost a few times and at once only."""
+    from prefect.events.clients import PrefectEventsClient
+    from prefect.events.worker import EventsWorker
+    from prefect.settings import PREFECT_API_URL
+
+    # The address distinguishes this server's events from those of one that an earlier night had.
+    EventsWorker.set_client_override(
+        PrefectEventsClient, api_url=PREFECT_API_URL.value(), reconnection_attempts=ATTEMPTS
+    )
