@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike
 from fieldcal.estimation.clock_sync import by_rates
 from fieldcal.estimation.clock_sync.by_field import refine_by_field
 from fieldcal.estimation.clock_sync.by_rates import SyncFit
+from fieldcal.estimation.clock_sync.search import find_clock
 from fieldcal.geometry.rotation import Array
+from fieldcal.stages import vps_poses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,6 +45,8 @@ class Synchronisation(SyncFit):
         The IMU's stamps, s, and rates as they were given.
     t_vps, vps_rate : (m,), (m, 3) arrays
         Stamps on the IMU's clock, s, and the VPS's rates put through `matrix`; NaN beside gaps.
+    findings : tuple of str
+        What was left out of the poses, or is odd about them.
 
     Examples
     --------
@@ -57,6 +61,7 @@ class Synchronisation(SyncFit):
     rate: Array = field(repr=False)
     t_vps: Array = field(repr=False)
     vps_rate: Array = field(repr=False)
+    findings: tuple[str, ...] = ()
 
     def plot(self) -> list[Axes]:
         """Rotation rates of both on the IMU's clock: the record, and its liveliest second."""
@@ -82,7 +87,9 @@ def synchronise(
 
     Coarse: masked, normalised cross-correlation of the rotation rates' lengths, which needs no alignment of frames.
     Fine: Gauss–Newton on ω_imu(t) ≈ M ω_vps(t) + c with the VPS's stamps moved and stretched; the free M (3, 3) takes
-    up mounting and calibration, so that neither moves the lag. Outliers among the poses are left out first.
+    up mounting and calibration, so that neither moves the lag. Poses that the VPS repeated, made up or got wrong are
+    left out first, as in a night. Where nothing matches within `max_lag_s`, clocks further apart, and of other rates,
+    are tried.
 
     Parameters
     ----------
@@ -93,11 +100,11 @@ def synchronise(
     magnetometer : (n, 3) array, optional
         Readings at `t_imu`, any unit, NaN where there is none: with less noise than rates they sharpen the lag.
     max_lag_s : float
-        Lags are sought between ± this. Take off whole differences between the clocks' epochs first.
+        Lags are sought between ± this first.
     min_peak : float
         Least correlation.
     max_gap_s : float
-        Longest gap between poses that is bridged, s.
+        Longest gap between poses that is bridged, s; of a slow system longer ones are.
 
     Returns
     -------
@@ -107,7 +114,8 @@ def synchronise(
     ------
     UnusableFlight
         `vps_too_short`, `flat_peak` (below `min_peak`), `ambiguous_peak` (the next best within 2 %),
-        `not_the_same_motion`; `err.measured` has the numbers.
+        `not_the_same_motion`, `vps_lost` (most poses are left out), `clock_rates_differ`; `err.measured` has the
+        numbers.
 
     Notes
     -----
@@ -132,12 +140,16 @@ def synchronise(
     stamps, q = np.asarray(t_vps, dtype=float), np.asarray(q_vps, dtype=float)
     if rate.shape != (len(t), 3) or q.shape != (len(stamps), 4):
         raise ValueError(f"(n,), (n, 3), (m,), (m, 4) wanted, got {t.shape}, {rate.shape}, {stamps.shape}, {q.shape}")
-    keep = by_rates.mask_outliers(stamps, q)
-    stamps, q = stamps[keep], q[keep]
+    admitted = vps_poses.admitted(stamps, q, max_gap_s)
+    vps_poses.need_most(admitted)
+    stamps, q, gap_s = admitted.t, admitted.q, admitted.max_gap_s
     centred = rate - np.median(rate, axis=0)
-    fit = by_rates.synchronise(t, centred, stamps, q, max_lag_s=max_lag_s, min_peak=min_peak, max_gap_s=max_gap_s)
+    fit = find_clock(t, centred, stamps, q, max_lag_s=max_lag_s, min_peak=min_peak, max_gap_s=gap_s)
     if magnetometer is not None:
-        fit, _ = refine_by_field(t, np.asarray(magnetometer, dtype=float), stamps, q, fit, max_gap_s=max_gap_s)
-    rates = by_rates.vps_rates(stamps, q, float(np.median(np.diff(stamps))), max_gap_s=max_gap_s)
+        fit, _ = refine_by_field(t, np.asarray(magnetometer, dtype=float), stamps, q, fit, max_gap_s=gap_s)
+    rates = by_rates.vps_rates(stamps, q, float(np.median(np.diff(stamps))), max_gap_s=gap_s)
     turned = np.where(rates.valid[:, None], rates.rate @ fit.matrix.T, np.nan)
-    return Synchronisation(**vars(fit), t=t, rate=rate, t_vps=fit.to_imu_clock(rates.t), vps_rate=turned)
+    told = tuple(
+        fault.sentence for fault in (*admitted.found, *vps_poses.far_clock(admitted, fit.lag_mid_s, max_lag_s))
+    )
+    return Synchronisation(**vars(fit), t=t, rate=rate, t_vps=fit.to_imu_clock(rates.t), vps_rate=turned, findings=told)

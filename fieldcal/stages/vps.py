@@ -79,7 +79,7 @@ def synchronise_vps(tables: Tables, s: VpsSyncSettings) -> StageResult:
         found = {"sync": row, "faults": fault_rows(faults)}
         return StageResult(found, Status.REFUSED, error.reason_code, str(error), measured)
     fit, by_field = _refined(fit, tables, origin, poses)
-    told = [*poses.found, *far_clock(poses, fit.lag_mid_s, s)]
+    told = [*poses.found, *far_clock(poses, fit.lag_mid_s, s.vps_max_lag_s)]
     measured |= {**by_field, "faults": [f.plain() for f in told]}
     row = _sync_row(
         {

@@ -71,9 +71,30 @@ def admitted_poses(vps: pl.DataFrame, origin_ns: int, length_s: float, s: VpsPos
     if abs(base_ns) * 1e-9 <= s.vps_max_lag_s + length_s:
         base_ns = 0
     t, logged = seconds(vps["t_ns"], origin_ns + base_ns), matrix(vps, QUATERNION)
+    return admitted(
+        t,
+        vps_attitude(logged, s),
+        s.vps_max_gap_s,
+        logged=logged,
+        position=in_ned(matrix(vps, POSITION), s.world),
+        base_s=base_ns * 1e-9,
+    )
+
+
+def admitted(
+    t: Array,
+    q: Array,
+    max_gap_s: float,
+    *,
+    logged: Array | None = None,
+    position: Array | None = None,
+    base_s: float = 0.0,
+) -> AdmittedPoses:
+    """The same of stamps (m,), s, and attitudes (m, 4), body to world."""
+    logged = q if logged is None else logged
+    position = np.full((len(t), 3), np.nan) if position is None else position
     repeats = find_repeats(t, logged)
     keep = ~(repeats.held | repeats.frozen | repeats.default)
-    q = vps_attitude(logged, s)
     jumps = np.zeros(len(t), dtype=bool)
     jumps[keep] = ~mask_outliers(t[keep], q[keep])
     keep &= ~jumps
@@ -100,14 +121,23 @@ def admitted_poses(vps: pl.DataFrame, origin_ns: int, length_s: float, s: VpsPos
         t[keep],
         logged[keep],
         q[keep],
-        in_ned(matrix(vps, POSITION), s.world)[keep],
-        base_ns * 1e-9,
+        position[keep],
+        base_s,
         float((repeats.frozen | repeats.default | jumps).mean()),
-        s.vps_max_gap_s,
+        max_gap_s,
         tuple(found),
         measured,
     )
-    return _with_gap(poses, s)
+    return _with_gap(poses)
+
+
+def need_most(poses: AdmittedPoses) -> None:
+    """Refuse poses of which most were left out (`vps_lost`): nobody knows then what the rest is."""
+    if poses.lost_share > LARGEST_LOST_SHARE:
+        told = " ".join(f.sentence for f in poses.found)
+        raise UnusableFlight(
+            ReasonCode.VPS_LOST, f"Most of the VPS's poses cannot be used. {told}", {"lost_share": poses.lost_share}
+        )
 
 
 def _masked(rows: np.ndarray, code: ReasonCode, what: str) -> list[Fault]:
@@ -122,26 +152,26 @@ def _masked(rows: np.ndarray, code: ReasonCode, what: str) -> list[Fault]:
     return [Fault(VPS, "", code, share, LARGEST_LOST_SHARE, False, sentence)]
 
 
-def _with_gap(poses: AdmittedPoses, s: VpsPoses) -> AdmittedPoses:
+def _with_gap(poses: AdmittedPoses) -> AdmittedPoses:
     """The gap that is bridged, by the system's own interval; how its stamps scatter."""
     if len(poses.t) < 3:
         return poses
     step = np.diff(poses.t)
     usual = step[step < 1.5 * np.median(step)]
     interval = float(usual.mean())  # the median of a few steps of jitter is beside it
-    gap = max(s.vps_max_gap_s, min(GAP_INTERVALS * interval, LONGEST_GAP_S))
+    gap = max(poses.max_gap_s, min(GAP_INTERVALS * interval, LONGEST_GAP_S))
     # From stamp to stamp, whole intervals taken off: both stamps' scatter is in it.
     off = step - np.maximum(np.rint(step / interval), 1.0) * interval
     jitter = robust_sigma(off[step < 10.0 * interval] - np.median(off)) / np.sqrt(2.0)
     found = list(poses.found)
-    longer = float(np.mean(step > s.vps_max_gap_s))
-    if gap > s.vps_max_gap_s and longer > SLOW_SHARE:
+    longer = float(np.mean(step > poses.max_gap_s))
+    if gap > poses.max_gap_s and longer > SLOW_SHARE:
         sentence = (
             f"The VPS gives a pose every {1e3 * interval:.0f} ms, {100 * longer:.0f} % of the"
-            f" intervals are longer than vps_max_gap_s = {s.vps_max_gap_s:g} s: gaps up to {1e3 * gap:.0f} ms are"
+            f" intervals are longer than vps_max_gap_s = {poses.max_gap_s:g} s: gaps up to {1e3 * gap:.0f} ms are"
             " bridged."
         )
-        found.append(Fault(VPS, "", ReasonCode.VPS_SLOW, interval, s.vps_max_gap_s, False, sentence))
+        found.append(Fault(VPS, "", ReasonCode.VPS_SLOW, interval, poses.max_gap_s, False, sentence))
     if jitter > JITTER_TOLD_S:
         sentence = (
             f"The VPS's stamps scatter by {1e3 * jitter:.1f} ms about a regular grid of {1e3 * interval:.4g} ms: if"
@@ -167,11 +197,7 @@ def clock_of(poses: AdmittedPoses, t_imu: Array, rate: Array, q: Array, s: VpsPo
         `vps_lost`: most poses are left out; `vps_mirrored`: no rotation makes the one's turns the other's; and those of
         `find_clock`.
     """
-    if poses.lost_share > LARGEST_LOST_SHARE:
-        told = " ".join(f.sentence for f in poses.found)
-        raise UnusableFlight(
-            ReasonCode.VPS_LOST, f"Most of the VPS's poses cannot be used. {told}", {"lost_share": poses.lost_share}
-        )
+    need_most(poses)
     try:
         fit = find_clock(
             t_imu,
@@ -229,12 +255,12 @@ def _peak(fit: SyncFit) -> dict[str, Json]:
     return {"peak": fit.peak, "runner_up": fit.runner_up, "coarse_lag_s": fit.lag_mid_s}
 
 
-def far_clock(poses: AdmittedPoses, lag_s: float, s: VpsPoses) -> tuple[Fault, ...]:
+def far_clock(poses: AdmittedPoses, lag_s: float, max_lag_s: float) -> tuple[Fault, ...]:
     """Told where the clocks are further apart than `vps_max_lag_s`, though they are not of different epochs."""
-    if abs(lag_s) <= s.vps_max_lag_s:
+    if abs(lag_s) <= max_lag_s:
         return ()
     sentence = (
         f"The VPS's clock and the IMU's are {abs(lag_s - poses.base_s):.4g} s apart, further than vps_max_lag_s ="
-        f" {s.vps_max_lag_s:g} s: the motion matches there and nowhere nearer."
+        f" {max_lag_s:g} s: the motion matches there and nowhere nearer."
     )
-    return (Fault(VPS, "", ReasonCode.VPS_FAR, abs(lag_s - poses.base_s), s.vps_max_lag_s, False, sentence),)
+    return (Fault(VPS, "", ReasonCode.VPS_FAR, abs(lag_s - poses.base_s), max_lag_s, False, sentence),)

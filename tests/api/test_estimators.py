@@ -111,5 +111,11 @@ def test_clocks(flight: fieldcal.SimulatedFlight, with_magnetometer: bool) -> No
     middle = flight.lag_at(sync.reference_s)
     assert abs(sync.lag_mid_s - middle) < FARTHEST * sync.lag_sd_s
     assert sync.lag_sd_s < (2e-4 if with_magnetometer else 2e-3)
-    with pytest.raises(fieldcal.UnusableFlight):
-        fieldcal.synchronise(flight.t, flight.counts["gyroscope"], flight.vps_t, flight.vps_q, max_lag_s=0.01)
+    assert "jump away" in sync.findings[0]
+    far = fieldcal.synchronise(flight.t, flight.counts["gyroscope"], flight.vps_t, flight.vps_q, max_lag_s=0.01)
+    assert abs(far.lag_mid_s - flight.lag_at(far.reference_s)) < FARTHEST * far.lag_sd_s
+    assert "further than vps_max_lag_s" in far.findings[-1]
+    frozen = np.where((flight.vps_t < flight.vps_t[-1] * 0.6)[:, None], flight.vps_q[:1], flight.vps_q)
+    with pytest.raises(fieldcal.UnusableFlight, match="Most of the VPS's poses") as refused:
+        fieldcal.synchronise(flight.t, flight.counts["gyroscope"], flight.vps_t, frozen)
+    assert refused.value.reason_code == "vps_lost"
