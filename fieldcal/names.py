@@ -36,6 +36,17 @@ VECTOR_SENSORS = (Sensor.MAGNETOMETER, Sensor.ACCELEROMETER)
 """Those that sense a known vector, the local field and gravity."""
 
 
+class DatedBy(StrEnum):
+    """What tells when a flight was."""
+
+    LOG = "log"
+    """Its clock."""
+    SESSION = "session"
+    """The date in the name of its session's folder."""
+    NAME = "name"
+    """Nothing: it is placed by the names of session and log."""
+
+
 class Approach(StrEnum):
     """What `method` in `fieldcal.toml` chooses for a sensor."""
 

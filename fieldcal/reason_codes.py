@@ -168,6 +168,8 @@ class ReasonCode(StrEnum):
     """The clock was set during the recording."""
     CLOCKS_APART = "clocks_apart"
     """Two sensors' stamps have no moment in common."""
+    TEMPERATURE_IMPLAUSIBLE = "temperature_implausible"
+    """A temperature that no inertial sensor has: counts, or another unit."""
     OUT_OF_ORDER = "out_of_order"
     """Rows that came after later ones were sorted in."""
     WILD_STAMPS = "wild_stamps"

@@ -165,9 +165,20 @@ STARTED_AT = Column(
     "started_at",
     pa.timestamp("us", tz="UTC"),
     "",
-    "time of the first IMU sample, UTC; null when the log's clock has no known epoch",
+    "time of the first IMU sample, UTC; where its clock has no known epoch the date in the session's name, or null",
 )
-LEAD = (FLIGHT_ID, VEHICLE_ID, IMU_ID, SESSION_ID, STARTED_AT)
+DATED_BY = Column(
+    "dated_by",
+    _TEXT,
+    "",
+    "what tells started_at: log (its clock), session (its folder's name), name (nothing does)",
+)
+SEQUENCE = Column(
+    "sequence", _TEXT, "", "orders flights that started_at does not: names of session and log, their numbers padded"
+)
+LEAD = (FLIGHT_ID, VEHICLE_ID, IMU_ID, SESSION_ID, STARTED_AT, DATED_BY, SEQUENCE)
+FLOWN_ORDER = (STARTED_AT.name, SEQUENCE.name, FLIGHT_ID.name)
+"""Columns that flights are in the order of time by; those without a time come first."""
 
 # --- flight
 LOG_URI = Column("log_uri", _TEXT, "", "path of the log relative to the archive")

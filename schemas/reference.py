@@ -8,3 +8,9 @@ REFERENCE_DEGC = 25.0
 UNCONFIRMED_SD = 5.0
 """Distance of the latest flight from its trend, in sd, beyond which it may be the first after a step: it stands alone
 until another session confirms it."""
+
+ENOUGH_SESSIONS = 5
+"""Fewer sessions than this are no trend: level, two slopes, and something left to judge them by."""
+
+PLAUSIBLE_DEGC = (-60.0, 150.0)
+"""What an inertial sensor's own temperature can be, °C."""

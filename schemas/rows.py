@@ -18,6 +18,8 @@ class FlightLead(TypedDict):
     imu_id: str
     session_id: str
     started_at: datetime | None
+    dated_by: str | None
+    sequence: str | None
 
 
 class _FlightFacts(FlightLead):

@@ -147,7 +147,7 @@ _HISTORY = (
     Table(
         "flight",
         "history",
-        1,
+        2,
         "one row a log, with its verdict",
         (
             *c.LEAD,

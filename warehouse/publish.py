@@ -12,6 +12,7 @@ import polars as pl
 from fieldcal import schemas
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import HISTORY_TABLES, SchemaMismatch
+from fieldcal.schemas.columns import SEQUENCE, STARTED_AT
 from fieldcal.warehouse import checksums
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import write_bytes
@@ -123,5 +124,5 @@ def _sorted(table: str, rows: pl.DataFrame) -> pl.DataFrame:
     if (double := rows.select(key).is_duplicated()).any():
         first = rows.filter(double).select(key).row(0)
         raise SchemaMismatch(f"{table}: more than one row with {', '.join(key)} = {', '.join(map(str, first))}")
-    order = key if table == "drift" else ["started_at", *key]
+    order = key if table == "drift" else [STARTED_AT.name, SEQUENCE.name, *key]
     return rows.sort(order, nulls_last=False)

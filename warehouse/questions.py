@@ -9,6 +9,7 @@ import polars as pl
 
 from fieldcal.errors import FieldcalError
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.warehouse import Warehouse, WarehouseError
 
 COLUMNS = (
@@ -17,6 +18,7 @@ COLUMNS = (
     "imu_id",
     "unit_id",
     "session_id",
+    "dated_by",
     "flight_id",
     "sensor",
     "method",
@@ -41,8 +43,8 @@ def calibration_history(
             rows = rows.filter(pl.col(column) == wanted)
     if since is not None:
         rows = rows.filter(pl.col("started_at") >= moment_of("--since", since))
-    order = ["started_at", "vehicle_id", "flight_id", "unit_id", "sensor", "method", "parameter", "axis"]
-    return rows.select(COLUMNS).sort(order, nulls_last=True).collect()
+    order = ["started_at", "vehicle_id", "sequence", "flight_id", "unit_id", "sensor", "method", "parameter", "axis"]
+    return rows.sort(order, nulls_last=True).select(COLUMNS).collect()
 
 
 def units_flown(warehouse: Warehouse, vehicle_id: str | None = None) -> pl.DataFrame:
@@ -51,7 +53,7 @@ def units_flown(warehouse: Warehouse, vehicle_id: str | None = None) -> pl.DataF
     last = (
         warehouse.scan("calibration", vehicle_id=vehicle_id)
         .filter("is_primary")
-        .sort("started_at", "flight_id", nulls_last=False)
+        .sort(FLOWN_ORDER, nulls_last=False)
         .with_columns(now=pl.col("imu_id").last().over("vehicle_id"))
         .filter(pl.col("imu_id") == pl.col("now"))
     )

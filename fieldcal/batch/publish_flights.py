@@ -21,6 +21,7 @@ from fieldcal.flight.rows import (
     run_rows,
 )
 from fieldcal.flight.units import Unit, units_of
+from fieldcal.flight.when import when
 from fieldcal.schemas.rows import FlightRow, RunRow
 from fieldcal.stages.pipeline import INGEST, PUBLISHED
 from fieldcal.warehouse.publish import publish, read_history
@@ -37,7 +38,8 @@ def publish_vehicle(
     """
     vehicle = configuration.vehicle(vehicle_id)
     former = read_history(root, "flight", vehicle_id)
-    fresh = _rows(flights, vehicle)
+    imu_ids = _imu_ids(flights, vehicle, former)
+    fresh = _rows(flights, vehicle, imu_ids)
     stale = _differing(root, vehicle, former, fresh, {job.flight_id: records for job, records in flights})
     places, ids = {job.log_uri for job, _ in flights}, [job.flight_id for job, _ in flights]
     gone = former.filter(pl.col("log_uri").is_in(list(places)) & ~pl.col("flight_id").is_in(ids))
@@ -46,10 +48,11 @@ def publish_vehicle(
         return ()
     own = {table: frame.filter(pl.col("flight_id").is_in(list(stale))) for table, frame in fresh.items()}
     made = [
-        (lead(job, vehicle.imu_id, records[INGEST]["facts"]), unit, _tables(root, job, unit, records))
+        (lead(job, imu_id, records[INGEST]["facts"]), unit, _tables(root, job, unit, records))
         for job, records in flights
         if job.flight_id in stale
-        for unit in units_of(records[INGEST]["facts"], vehicle)
+        for imu_id in (imu_ids[job.flight_id],)
+        for unit in units_of(records[INGEST]["facts"], vehicle, imu_id)
     ]
     return publish(root, vehicle_id, {**own, **published_tables(made)} if stale else {}, stale | leaving)
 
@@ -59,15 +62,30 @@ def withdraw(root: Path, vehicle_id: str, flights: set[str]) -> None:
     publish(root, vehicle_id, {}, flights)
 
 
-def _rows(flights: Sequence[tuple[Job, Mapping[str, Record]]], vehicle: Vehicle) -> dict[str, pl.DataFrame]:
+def _imu_ids(
+    flights: Sequence[tuple[Job, Mapping[str, Record]]], vehicle: Vehicle, former: pl.DataFrame
+) -> dict[str, str]:
+    """flight_id → the IMU that was on board. An `imu_id` without dates says what is on board now: it holds for flights
+    that are new, and those that are in the history keep theirs."""
+    known = {} if vehicle.dated else dict(former.select("flight_id", "imu_id").iter_rows())
+    return {
+        job.flight_id: known.get(job.flight_id) or vehicle.imu_at(when(job, records[INGEST]["facts"])["started_at"])
+        for job, records in flights
+    }
+
+
+def _rows(
+    flights: Sequence[tuple[Job, Mapping[str, Record]]], vehicle: Vehicle, imu_ids: Mapping[str, str]
+) -> dict[str, pl.DataFrame]:
     """`flight` and `run` as they should be."""
     flight_rows: list[FlightRow] = []
     step_rows: list[RunRow] = []
     for job, records in flights:
         facts = judged(records[INGEST]["facts"], records)
-        leading = lead(job, vehicle.imu_id, facts)
+        imu_id = imu_ids[job.flight_id]
+        leading = lead(job, imu_id, facts)
         flight_rows.append(flight_row(job, leading, facts))
-        step_rows += run_rows(leading, units_of(facts, vehicle), records)
+        step_rows += run_rows(leading, units_of(facts, vehicle, imu_id), records)
     return {"flight": rows_frame("flight", flight_rows), "run": rows_frame("run", step_rows)}
 
 
@@ -102,7 +120,7 @@ def _row_count(table: str, records: Mapping[str, Record], vehicle: Vehicle) -> i
     """How many rows a flight has in a table of the history."""
     outputs = [
         records[unit.step(stage)]["outputs"].get(name)
-        for unit in units_of(records[INGEST]["facts"], vehicle)
+        for unit in units_of(records[INGEST]["facts"], vehicle, vehicle.vehicle_id)
         if publishes(table, unit)
         for stage, name in (source.split(".") for source in PUBLISHED[table])
         if unit.step(stage) in records

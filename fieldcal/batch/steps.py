@@ -91,7 +91,7 @@ class FlightWork:
     def further(self) -> Iterator[FlightWork]:
         """The work on each further unit on board that is to be calibrated."""
         facts = self.records[INGEST]["facts"]
-        for unit in units_of(facts, self._vehicle)[1:] if self.usable() else ():
+        for unit in units_of(facts, self._vehicle, self.job.vehicle_id)[1:] if self.usable() else ():
             other = FlightWork(self._root, self.job, self._vehicle, unit.table)
             other._take(INGEST, self.records[INGEST])
             yield other
@@ -157,7 +157,7 @@ class FlightWork:
         if step != INGEST:
             self._inputs |= {f"{stage}.{table}": output["sha256"] for table, output in record["outputs"].items()}
         else:
-            seen = signals_of(self.table, record["signals"])
+            seen = signals_of(self.table, record["signals"].keys() - set(record["facts"]["left_out"]))
             self._inputs |= {f"{INGEST}.{name}": record["signals"][table]["sha256"] for name, table in seen.items()}
             self._settings = ingest.settings_of(record["facts"], self._vehicle, self.table) if self.usable() else None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from fieldcal.cli.options import AsJson, UnusedConfig, UnusedRoot
 
 if TYPE_CHECKING:
     from fieldcal.config.origins import Entry
+    from fieldcal.names import Json
 
 OK, WRONG = 0, 2
 
@@ -127,4 +129,14 @@ def _line(entry: Entry) -> str:
     told = "; ".join(part for part in (entry.source, entry.unit, entry.meaning) if part)
     if entry.value is None:
         return f"# {key_path(*entry.keys)}: not configured  # {told}"
-    return f"{key_path(*entry.keys)} = {json.dumps(entry.value, ensure_ascii=False)}  # {told}"
+    return f"{key_path(*entry.keys)} = {_toml(entry.value)}  # {told}"
+
+
+def _toml(value: Json) -> str:
+    """A value as TOML writes it. What a table has from a date on is the date, without quotes."""
+    if isinstance(value, Mapping):
+        inside = (f"{key} = {item if key == 'from' else _toml(item)}" for key, item in value.items())
+        return f"{{ {', '.join(inside)} }}"
+    if isinstance(value, list):
+        return f"[{', '.join(_toml(item) for item in value)}]"
+    return json.dumps(value, ensure_ascii=False)

@@ -187,8 +187,8 @@ def history(
 
     rows = fieldcal.Warehouse(warehouse).history(vehicle=vehicle, sensor=sensor, parameter=parameter, since=since)
     whole = as_json or as_csv
-    one = rows["unit_id"].equals(rows["imu_id"])
-    hidden = ["imu_id", "session_id", "flight_id", *(["unit_id"] if one else [])]
+    usual = [("unit_id", rows["unit_id"].equals(rows["imu_id"])), ("dated_by", (rows["dated_by"] == "log").all())]
+    hidden = ["imu_id", "session_id", "flight_id", *(name for name, is_usual in usual if is_usual)]
     print_frame(rows if whole else rows.drop(hidden), as_json=as_json, as_csv=as_csv)
     return OK
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
@@ -22,6 +23,7 @@ from fieldcal.config.values import (
     Character,
     ImuColumns,
     ImuFields,
+    ImuIds,
     Methods,
     PerSensor,
     Positive,
@@ -158,7 +160,9 @@ class McapMap(Table):
 class VehicleTable(Table):
     """What the file may say of a vehicle. None: the log decides."""
 
-    imu_id: Annotated[Text | None, _meaning("the IMU on board; else the vehicle's own name stands for it")] = None
+    imu_id: Annotated[
+        ImuIds | None, _meaning("the IMU on board, or several with the day from which each is; else the vehicle's name")
+    ] = None
     method: Annotated[Methods, _meaning("how sensors are calibrated; one name for all, or one for each")] = {}
     profile: Annotated[ProfileName, _meaning("presets of the stage parameters")] = "full"
     world: Annotated[World | None, _meaning("axes of the world that the VPS's attitudes refer to")] = None
@@ -189,7 +193,21 @@ class Vehicle(VehicleTable):
     """All that is configured of one vehicle, defaults and profile worked in; method and polarity of every sensor."""
 
     vehicle_id: str
-    imu_id: str
+    imu_id: ImuIds
+
+    @property
+    def dated(self) -> bool:
+        """Whether the configuration says which IMU was on board when, also in the past."""
+        return not isinstance(self.imu_id, str)
+
+    def imu_at(self, moment: datetime | None) -> str:
+        """The IMU on board at a moment; of an unknown one, the last. Before the first, the vehicle's own name."""
+        if isinstance(self.imu_id, str):
+            return self.imu_id
+        on_board = [
+            one for one in sorted(self.imu_id, key=lambda one: one.since) if moment is None or one.since <= moment
+        ]
+        return on_board[-1].id if on_board else self.vehicle_id
 
     def settings(self) -> dict[str, Json]:
         """Plain JSON of everything that can change results; names of vehicle and IMU do not, nor does the profile's,

@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 from fieldcal.config.configuration import Configuration, LocalField, VehicleTable
 from fieldcal.config.mistakes import key_path
 from fieldcal.config.parameters import PROFILES, Parameters
-from fieldcal.config.values import Table
+from fieldcal.config.values import DatedImu, Table
 from fieldcal.names import Json, ProfileName
 
 DEFAULT = "default"
@@ -31,13 +31,17 @@ class Entry:
     meaning: str
 
 
+NOBODY = "\0"
+"""Stands for a vehicle that no file names."""
+
+
 def effective(configuration: Configuration, vehicle_id: str | None) -> list[Entry]:
     """Every value that holds for a vehicle; of None, for one that the file does not name."""
     document = configuration.document
     layers: list[tuple[str, Table]] = [("[defaults]", document.defaults)]
     if vehicle_id in document.vehicles:
         layers.insert(0, (f"[{key_path('vehicles', vehicle_id)}]", document.vehicles[vehicle_id]))
-    vehicle = configuration.vehicle(vehicle_id or "")
+    vehicle = configuration.vehicle(vehicle_id or NOBODY)
     entries = _entries(vehicle, layers, (), vehicle.profile)
     return [entry for entry in entries if vehicle_id is not None or entry.keys != ("imu_id",)]
 
@@ -77,6 +81,8 @@ def _entry(keys: tuple[str, ...], value: object, source: str, field: FieldInfo) 
 
 
 def _plain(value: object) -> Json:
+    if isinstance(value, DatedImu):
+        return value.table()
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
     return str(value) if isinstance(value, str) else cast("float | None", value)

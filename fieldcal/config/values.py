@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, time
 from typing import Annotated, ClassVar, NoReturn, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
@@ -36,17 +38,17 @@ def shown(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def require_keys(value: object, known: Iterable[str]) -> Mapping[str, object]:
+def require_keys(value: object, known: Iterable[str], *at: str) -> Mapping[str, object]:
     """A table, all of whose keys are known."""
     if not isinstance(value, Mapping):
-        wrong(ReasonCode.WRONG_TYPE, f"a table is needed here, not {shown(value)}")
+        wrong(ReasonCode.WRONG_TYPE, f"a table is needed here, not {shown(value)}", *at)
     allowed = [str(key) for key in known]
     for key in value:
         if key not in allowed:
             nearest = difflib.get_close_matches(key.lower(), allowed, n=1, cutoff=0.0)
             close = difflib.get_close_matches(key.lower(), allowed, n=1, cutoff=0.6)
             hint = f'did you mean "{nearest[0]}"?' + ("" if close else f" Known here: {', '.join(allowed)}")
-            wrong(ReasonCode.UNKNOWN_KEY, f'there is no key "{key}"; {hint}')
+            wrong(ReasonCode.UNKNOWN_KEY, f'there is no key "{key}"; {hint}', *at)
     return value
 
 
@@ -143,6 +145,43 @@ def _by_sensor(value: object) -> dict[Sensor, object]:
     return {Sensor(key): item for key, item in require_keys(value, SENSORS).items()}
 
 
+@dataclass(frozen=True)
+class DatedImu:
+    """An IMU that a vehicle carries from a moment on, UTC; `from_` as it stands in the file, None since ever."""
+
+    id: str
+    from_: date | None = None
+
+    @property
+    def since(self) -> datetime:
+        """The moment."""
+        if self.from_ is None:
+            return datetime.min.replace(tzinfo=UTC)
+        moment = self.from_ if isinstance(self.from_, datetime) else datetime.combine(self.from_, time())
+        return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+
+    def table(self) -> dict[str, names.Json]:
+        """As the file has it."""
+        return {"id": self.id, **({} if self.from_ is None else {"from": self.from_.isoformat()})}
+
+
+def _imu_ids(value: object) -> object:
+    """One name, or a list of names each with the day from which it holds."""
+    if isinstance(value, tuple) or (isinstance(value, str) and value):  # a tuple was checked before
+        return value
+    if not isinstance(value, list) or not value:
+        wrong(ReasonCode.WRONG_TYPE, f"a text is needed here, or a list of tables with id and from, not {shown(value)}")
+    return tuple(_dated_imu(item, str(place)) for place, item in enumerate(value))
+
+
+def _dated_imu(value: object, place: str) -> DatedImu:
+    table = require_keys(value, ("id", "from"), place)
+    moment = table.get("from")
+    if moment is not None and not isinstance(moment, date):
+        wrong(ReasonCode.WRONG_TYPE, f"a date such as 2026-05-04 is needed here, not {shown(moment)}", place, "from")
+    return DatedImu(_text(table.get("id"), place, "id"), moment)
+
+
 def require_choice(value: object, allowed: Iterable[str], *at: str) -> str:
     """One of the allowed texts."""
     listed = list(allowed)
@@ -190,6 +229,26 @@ PositiveTriple = Annotated[
     tuple[Positive, Positive, Positive],
     BeforeValidator(_one_or_three),
     WithJsonSchema({"anyOf": [_ONE_NUMBER, _THREE_NUMBERS]}),
+]
+ImuIds = Annotated[
+    str | tuple[DatedImu, ...],
+    BeforeValidator(_imu_ids),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "string"},
+                {
+                    "type": "array",
+                    "items": {
+                        "type": "object",
+                        "properties": {"id": {"type": "string"}, "from": {"type": "string", "format": "date"}},
+                        "required": ["id"],
+                        "additionalProperties": False,
+                    },
+                },
+            ]
+        }
+    ),
 ]
 Signs = Annotated[
     names.Signs,

@@ -13,6 +13,7 @@ from fieldcal.errors import FieldcalError
 from fieldcal.exports.calibration import Constants, Triad, cubic_about
 from fieldcal.names import INERTIAL_FIRST
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.stages.tables import AXES
 from fieldcal.warehouse.questions import existing, units_flown
@@ -79,7 +80,7 @@ def constants_of(
     if rows.is_empty():
         told = "" if unit_id is None else f" of unit {unit_id!r}; there is: {', '.join(units)}"
         raise FieldcalError(ReasonCode.NO_CALIBRATION, f"No calibration of vehicle {vehicle_id!r} is known{told}.")
-    last = rows.sort("started_at", "flight_id", nulls_last=False).row(-1, named=True)
+    last = rows.sort(FLOWN_ORDER, nulls_last=False).row(-1, named=True)
     triads: dict[str, Triad] = {
         s: triad for s in INERTIAL_FIRST if (triad := _triad(rows.filter(sensor=s), at)) is not None
     }

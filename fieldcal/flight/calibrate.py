@@ -17,6 +17,7 @@ from fieldcal.flight.rows import flight_row, judged, lead, published_tables, row
 from fieldcal.flight.threads import one_thread
 from fieldcal.flight.units import Unit, units_of
 from fieldcal.flight.versions import versions
+from fieldcal.flight.when import when
 from fieldcal.logs import flight_id, ingest, log_format, log_sha256
 from fieldcal.logs.facts import Facts
 from fieldcal.logs.on_board import PRIMARY, signals_of
@@ -107,10 +108,11 @@ def run_stages(log: LogRead, table: str = PRIMARY) -> CalibratedLog:
         `wrong_option`: there is no such unit on board.
     """
     job, vehicle, facts = log.job, log.vehicle, log.facts
-    unit = _unit_of(log, table)
+    imu_id = vehicle.imu_at(when(job, facts)["started_at"])
+    unit = _unit_of(log, table, imu_id)
     records: dict[str, StepRecord] = {INGEST: _record(_ingest_result(facts))}
     settings: FlightSettings | None = None
-    seen = signals_of(table, log.signals)
+    seen = signals_of(table, log.signals.keys() - set(facts["left_out"]))
     tables: dict[str, pl.DataFrame] = {f"{INGEST}.{name}": log.signals[place] for name, place in seen.items()}
     if Verdict(facts["verdict"]).usable:
         settings = ingest.settings_of(facts, vehicle, table)
@@ -124,7 +126,7 @@ def run_stages(log: LogRead, table: str = PRIMARY) -> CalibratedLog:
             records[stage.name] = _record(result)
             tables |= {f"{stage.name}.{name}": frame for name, frame in result.tables.items()}
     facts = judged(facts, records)
-    leading = lead(job, vehicle.imu_id, facts)
+    leading = lead(job, imu_id, facts)
     published = published_tables([(leading, unit, {name: (frame, None) for name, frame in tables.items()})])
     sync = typed(rows_of(published["sync"]), SyncRow)
     flight = rows_frame("flight", [flight_row(job, leading, facts)])
@@ -139,8 +141,8 @@ def run_stages(log: LogRead, table: str = PRIMARY) -> CalibratedLog:
     return CalibratedLog(document, tables, settings)
 
 
-def _unit_of(log: LogRead, table: str) -> Unit:
-    units = {unit.table: unit for unit in units_of(log.facts, log.vehicle)}
+def _unit_of(log: LogRead, table: str, imu_id: str) -> Unit:
+    units = {unit.table: unit for unit in units_of(log.facts, log.vehicle, imu_id)}
     if table not in units:
         raise FieldcalError(
             ReasonCode.WRONG_OPTION, f"{log.job.log_uri} has no unit {table!r}; there is {', '.join(units)}."

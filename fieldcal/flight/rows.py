@@ -12,7 +12,7 @@ from fieldcal import schemas
 from fieldcal.flight.job import Job
 from fieldcal.flight.record import Refusal, StepRecord
 from fieldcal.flight.units import Unit
-from fieldcal.logs import ingest
+from fieldcal.flight.when import when
 from fieldcal.logs.facts import Facts, FindingFacts
 from fieldcal.logs.on_board import PRIMARY
 from fieldcal.names import Json, Sensor, Status, Verdict
@@ -28,6 +28,8 @@ LEAD_SCHEMA = pl.Schema(
         "imu_id": pl.String(),
         "session_id": pl.String(),
         "started_at": pl.Datetime("us", "UTC"),
+        "dated_by": pl.String(),
+        "sequence": pl.String(),
         "unit_id": pl.String(),
         "is_primary": pl.Boolean(),
         "run_key": pl.String(),
@@ -44,7 +46,7 @@ def lead(job: Job, imu_id: str, facts: Facts) -> FlightLead:
         "vehicle_id": job.vehicle_id,
         "imu_id": imu_id,
         "session_id": job.session_id,
-        "started_at": ingest.started_at(facts),
+        **when(job, facts),
     }
 
 

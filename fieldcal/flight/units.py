@@ -32,14 +32,14 @@ class Unit:
         return step_of(stage, self.table)
 
 
-def units_of(facts: Facts, vehicle: Vehicle) -> list[Unit]:
+def units_of(facts: Facts, vehicle: Vehicle, imu_id: str) -> list[Unit]:
     """The units that are calibrated, the primary one first; the further ones unless the vehicle's are not asked for.
 
     A unit is called by its board, then by its device id, frame or instance. The board is the `imu_id` that is
     configured, else the autopilot's serial number, else the vehicle; where the log tells of one unit, that is all.
     """
-    configured = vehicle.imu_id != vehicle.vehicle_id
-    board = vehicle.imu_id if configured else facts["board_id"] or vehicle.imu_id
+    configured = imu_id != vehicle.vehicle_id
+    board = imu_id if configured else facts["board_id"] or imu_id
     on_board = facts["units_on_board"] or [{"table": PRIMARY, "devices": {}, "applied": {}}]
     units = []
     for one in on_board[: None if vehicle.units_on_board == "all" else 1]:

@@ -47,14 +47,16 @@ class UnitFacts(TypedDict):
 
 
 class Facts(Declared, Judged):
-    """All of it. `rows` by signal table; `position` mean latitude and longitude, degrees, and altitude, m; `board_id`
-    the autopilot's serial number; `units_on_board` the primary one first."""
+    """All of it. `rows` by signal table; `left_out` tables that no stage may read; `position` mean latitude and
+    longitude, degrees, and altitude, m; `board_id` the autopilot's serial number; `units_on_board` the primary one
+    first."""
 
     duration_s: float | None
     imu_rate_hz: float | None
     vps_rate_hz: float | None
     n_samples: int | None
     rows: dict[str, int]
+    left_out: list[str]
     temperature_min_degc: float | None
     temperature_mean_degc: float | None
     temperature_max_degc: float | None

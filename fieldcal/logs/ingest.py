@@ -24,6 +24,7 @@ from fieldcal.logs.facts import Declared, Facts, FindingFacts, Judged
 from fieldcal.logs.interface import EPOCH_KNOWN_AFTER_NS
 from fieldcal.logs.on_board import PRIMARY, UNIT_TABLES, units_on_board
 from fieldcal.logs.tidy import HELD_ROWS, Disordered, TidySignal
+from fieldcal.logs.warmth import Warmth
 from fieldcal.names import SENSORS, Rotation, Sensor, Triple, Verdict
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import signal_kind
@@ -58,7 +59,7 @@ class TidyLog:
         self._name = name
         self._held_rows = None if whole else HELD_ROWS
         self._signals: dict[str, TidySignal] = {}
-        self._temperature: list[float] | None = None
+        self._warmth: dict[str, Warmth] = {}
         self._position = np.zeros(3)
         self._read_through = False
 
@@ -105,10 +106,8 @@ class TidyLog:
         return dict(self._reader.summary.units) if self._read_through else None
 
     def _seen(self, table: str, frame: pl.DataFrame) -> pl.DataFrame:
-        if table == "temperature":
-            t = frame["temperature_degc"].to_numpy()
-            low, total, high = self._temperature or [np.inf, 0.0, -np.inf]
-            self._temperature = [min(low, float(t.min())), total + float(t.sum()), max(high, float(t.max()))]
+        if signal_kind(table) == "temperature":
+            self._warmth.setdefault(table, Warmth()).add(frame["temperature_degc"].to_numpy())
         elif table == "position":
             self._position += (
                 frame.select("latitude_deg", "longitude_deg", "altitude_m").fill_nan(0.0).sum().to_numpy()[0]
@@ -121,7 +120,8 @@ class TidyLog:
             for table, signal in self._signals.items()
             for finding in signal.findings(self._name)
         ]
-        return [*self._reader.summary.findings, *own, *self._apart()]
+        warmth = [one.finding(self._name, table) for table, one in self._warmth.items() if not one.plausible]
+        return [*self._reader.summary.findings, *own, *self._apart(), *warmth]
 
     def _sound(self) -> list[str]:
         """The further units' tables of which enough is sound, in the order of their numbers."""
@@ -160,8 +160,8 @@ class TidyLog:
         imu = self._signals["imu"]
         first_ns, last_ns = imu.first_ns or 0, imu.last_ns or 0
         vps, place = self._signals.get("vps"), self._signals.get("position")
-        low, total, high = self._temperature or (None, None, None)
-        n_temperatures = self._signals["temperature"].rows if self._temperature else 1
+        warmth = self._warmth.get("temperature")
+        warmth = warmth if warmth is not None and warmth.plausible else None
         return {
             **declared(summary),
             "duration_s": (last_ns - first_ns) * 1e-9,
@@ -169,9 +169,10 @@ class TidyLog:
             "vps_rate_hz": vps.rate_hz() if vps else None,
             "n_samples": imu.rows,
             "rows": {table: signal.rows for table, signal in sorted(self._signals.items())},
-            "temperature_min_degc": low,
-            "temperature_mean_degc": None if total is None else total / n_temperatures,
-            "temperature_max_degc": high,
+            "left_out": sorted(table for table, one in self._warmth.items() if not one.plausible),
+            "temperature_min_degc": None if warmth is None else warmth.lowest,
+            "temperature_mean_degc": None if warmth is None else warmth.total / warmth.rows,
+            "temperature_max_degc": None if warmth is None else warmth.highest,
             "started_at_ns": first_ns if summary.epoch_known and first_ns > EPOCH_KNOWN_AFTER_NS else None,
             "position": [float(v) for v in self._position / place.rows] if place and place.rows else None,
             "board_id": summary.board_id,
@@ -230,6 +231,7 @@ def rejected(reason_code: ReasonCode, reason: str) -> Facts:
         "imu_rate_hz": None,
         "vps_rate_hz": None,
         "n_samples": None,
+        "left_out": [],
         "temperature_min_degc": None,
         "temperature_mean_degc": None,
         "temperature_max_degc": None,

@@ -16,6 +16,7 @@ from fieldcal.report.links import Links, flight_name, vehicle_name
 from fieldcal.report.page import Column, Notice, Page, Part, Section, Table, Text, badge
 from fieldcal.report.trend import change_sentence, worst_status
 from fieldcal.report.words import age, day, plain_name, with_unit
+from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.rows import DriftRow, FitRow, FlightRow
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.questions import existing, units_flown
@@ -62,9 +63,7 @@ def fleet_page(root: Path, links: Links, as_of: datetime | None) -> Page:
     trends = {str(key[0]): part for key, part in of_vehicles.partition_by("vehicle_id", as_dict=True).items()}
     sparks = key_parameters(warehouse, flown, trends)
     rows, statuses = [], dict.fromkeys((*GRAVEST_FIRST, NOT_ANALYSED), 0)
-    for key, part in (
-        flights.sort("vehicle_id", "started_at", "flight_id").partition_by("vehicle_id", as_dict=True).items()
-    ):
+    for key, part in flights.sort("vehicle_id", *FLOWN_ORDER).partition_by("vehicle_id", as_dict=True).items():
         vehicle = str(key[0])
         status = worst_status(trends.get(vehicle))
         statuses[status or NOT_ANALYSED] += 1

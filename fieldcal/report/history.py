@@ -10,6 +10,7 @@ import polars as pl
 
 from fieldcal.names import Status
 from fieldcal.report.words import day
+from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
 from fieldcal.warehouse import Warehouse
 
@@ -62,9 +63,9 @@ def usable_flights(warehouse: Warehouse, vehicle_id: str | None = None) -> pl.Da
     return (
         warehouse.scan("calibration", vehicle_id=vehicle_id)
         .filter((pl.col("status") == Status.OK) & pl.col("value").is_not_null() & (pl.col("method") != WARM_UP))
-        .select("vehicle_id", "flight_id", "started_at")
+        .select("vehicle_id", *FLOWN_ORDER)
         .unique()
-        .sort("vehicle_id", "started_at", "flight_id", nulls_last=False)
+        .sort("vehicle_id", *FLOWN_ORDER, nulls_last=False)
         .collect()
     )
 

@@ -9,6 +9,7 @@ import polars as pl
 from fieldcal.names import GRAVEST_FIRST, INERTIAL_FIRST, DriftStatus, Status
 from fieldcal.report.plot import sparkline
 from fieldcal.report.words import PARAMETERS, count, preferred, scientific, unit, with_unit
+from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.rows import DriftRow
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.rows import typed
@@ -27,8 +28,8 @@ def key_parameters(
     rows = (
         warehouse.scan("calibration")
         .filter((pl.col("status") == Status.OK) & pl.col("value").is_not_null())
-        .select("vehicle_id", "unit_id", *PLACE, "value", "unit", "started_at", "flight_id")
-        .sort("started_at", "flight_id", nulls_last=False)
+        .select("vehicle_id", "unit_id", *PLACE, "value", "unit", *FLOWN_ORDER)
+        .sort(FLOWN_ORDER, nulls_last=False)
         .collect()
     )
     present = rows.join(flown, on=["vehicle_id", "unit_id", "sensor"], how="semi", maintain_order="left")

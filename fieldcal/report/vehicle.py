@@ -17,6 +17,7 @@ from fieldcal.report.page import Column, Folded, Heading, Notice, Page, Part, Se
 from fieldcal.report.trend import change_sentence, fly_with_sentence, worst_status
 from fieldcal.report.vehicle_figures import MOST_POINTS, agreement_plot, lag_plot, parameter_plot
 from fieldcal.report.words import PARAMETERS, age, count, day, plain_name, preferred, scientific, unit
+from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.schemas.rows import DriftRow, UnfoldedFlight
 from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
@@ -34,9 +35,7 @@ OPEN = ("scale", "zero_bias", WARM_UP_SLOPE)
 def vehicle_page(root: Path, vehicle_id: str, links: Links, as_of: datetime | None) -> Page:
     """The page, from the history below `root`."""
     warehouse = existing(root)
-    flights = (
-        warehouse.scan("flight", vehicle_id=vehicle_id).sort("started_at", "flight_id", nulls_last=False).collect()
-    )
+    flights = warehouse.scan("flight", vehicle_id=vehicle_id).sort(FLOWN_ORDER, nulls_last=False).collect()
     if flights.is_empty():
         raise FieldcalError(ReasonCode.NOT_FOUND, _no_vehicle(warehouse, vehicle_id))
     moment = as_of or newest(warehouse)
@@ -86,8 +85,8 @@ def _no_vehicle(warehouse: Warehouse, vehicle_id: str) -> str:
 
 def _units(warehouse: Warehouse, vehicle_id: str, flown: pl.DataFrame) -> list[str]:
     """Units that the vehicle has carried: those it flew with last, then the others, the latest first."""
-    rows = warehouse.scan("calibration", vehicle_id=vehicle_id).select("unit_id", "started_at", "flight_id")
-    others = rows.sort("started_at", "flight_id", "unit_id", nulls_last=False).collect()["unit_id"].reverse()
+    rows = warehouse.scan("calibration", vehicle_id=vehicle_id).select("unit_id", *FLOWN_ORDER)
+    others = rows.sort(*FLOWN_ORDER, "unit_id", nulls_last=False).collect()["unit_id"].reverse()
     primary = flown.sort("sensor", descending=True)["unit_id"].to_list()
     return list(dict.fromkeys([*primary, *others.to_list()]))
 
@@ -218,7 +217,7 @@ def _parameters(warehouse: Warehouse, vehicle_id: str, units: list[str], drift: 
     rows = (
         warehouse.scan("calibration")
         .filter(pl.col("unit_id").is_in(units) & pl.col("value").is_not_null())
-        .sort("started_at", "flight_id", nulls_last=False)
+        .sort(FLOWN_ORDER, nulls_last=False)
         .collect()
     )
     panels = max(3 * len(units), rows.select("unit_id", "axis").unique().height)

@@ -16,6 +16,7 @@ from fieldcal.report.page import Plot
 from fieldcal.report.plot import INK, XYZ, Across, headed, legend_below, panels, svg
 from fieldcal.report.trend import days_after, predicted, warmed
 from fieldcal.report.words import count, day, unit
+from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.schemas.rows import DriftRow
 
@@ -216,7 +217,7 @@ COMPARED = (
 
 def agreement_plot(fit: pl.DataFrame, anchor: str) -> Plot | None:
     """Theil inequality coefficients and rms errors over the flights, smoothed readings."""
-    smoothed = fit.filter(pl.col("signal") == "smoothed", pl.col("tic").is_not_null()).sort("started_at", "flight_id")
+    smoothed = fit.filter(pl.col("signal") == "smoothed", pl.col("tic").is_not_null()).sort(FLOWN_ORDER)
     curves = []
     for quantity, method, reference, label in COMPARED:
         own = smoothed.filter(pl.col("quantity") == quantity)
@@ -256,7 +257,7 @@ def lag_plot(sync: pl.DataFrame, anchor: str) -> Plot | None:
     """The VPS clock's lag at mid-flight and its rate over the flights."""
     good = (
         sync.filter(pl.col("status") == Status.OK, pl.col("lag_mid_s").is_not_null())
-        .sort("started_at", "flight_id")
+        .sort(FLOWN_ORDER)
         .tail(MOST_POINTS)
     )
     if good.is_empty():

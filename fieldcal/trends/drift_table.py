@@ -11,13 +11,16 @@ import polars as pl
 from fieldcal.names import GRAVEST_FIRST, RESIDUAL, Status
 from fieldcal.provenance.run_key import run_key, source_digest
 from fieldcal.schemas import TABLES
+from fieldcal.schemas.columns import FLOWN_ORDER
+from fieldcal.schemas.reference import ENOUGH_SESSIONS
 from fieldcal.schemas.rows import DriftRow
-from fieldcal.trends import few_sessions, regression, siblings
+from fieldcal.trends import few_sessions, regression, siblings, temperatures
 from fieldcal.trends.curves import Bends, Bent, bends_of, bent
 from fieldcal.trends.evidence import evidence
 from fieldcal.trends.evidence_cache import Memory
+from fieldcal.trends.one_sensor import of_present_sensor, told
 from fieldcal.trends.reasons import AGREEMENT, VPS, reason
-from fieldcal.trends.series import ENOUGH_SESSIONS, Histories
+from fieldcal.trends.series import Histories
 from fieldcal.trends.warm_up_slopes import slopes_of_warm_ups
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.layout import history_files, vehicle_of
@@ -71,6 +74,8 @@ def table_of(flights: pl.DataFrame, bends: Bends = NO_BENDS, memory: Memory | No
     """The table `drift` of `history_of_everything`'s rows and of `bends_of`'s curves."""
     if flights.is_empty():
         return empty_frame("drift")
+    flights, doubts = temperatures.judged(flights)
+    flights, exchanged = of_present_sensor(flights)
     rows, trends, borrowed = trends_of(flights, bends, memory or Memory())
     group, kind, value, sd = _siblings(rows, trends)
     stepped, drifting = regression.moving(trends)
@@ -101,7 +106,8 @@ def table_of(flights: pl.DataFrame, bends: Bends = NO_BENDS, memory: Memory | No
         status=pl.Series(regression.statuses(trends, fleet_p).tolist(), dtype=pl.String),
     )
     reasons = [reason(row) for row in typed(result.iter_rows(named=True), DriftRow)]
-    explained = result.with_columns(reason=pl.Series(reasons, dtype=pl.String))
+    explained = told(result.with_columns(reason=pl.Series(reasons, dtype=pl.String)), exchanged)
+    explained = temperatures.with_notes(explained, doubts)
     return explained.select(TABLES["drift"].column_names).sort(KEY)
 
 
@@ -112,7 +118,7 @@ def history_of_everything(root: Path) -> pl.DataFrame:
     flights with a time where any has one.
     """
     warehouse = Warehouse(root)
-    lead = ["vehicle_id", "imu_id", "unit_id", "session_id", "flight_id", "started_at"]
+    lead = ["vehicle_id", "imu_id", "unit_id", "session_id", *FLOWN_ORDER]
     columns = [*lead, "sensor", "method", "parameter", "axis", "value", "sd", "unit", "temperature_degc"]
     # What remains of an autopilot's own correction steps with its parameters, not with the sensor.
     own = (pl.col("status") == Status.OK) & ~pl.col("parameter").str.starts_with(RESIDUAL)
@@ -144,7 +150,7 @@ def history_of_everything(root: Path) -> pl.DataFrame:
     )
     rows = pl.concat([calibration, *clock, fit]).filter(pl.col("value").is_finite()).collect()
     timed = pl.col("started_at").is_not_null()
-    order = [*KEY, "started_at", "vehicle_id", "flight_id"]
+    order = [*KEY, "started_at", "vehicle_id", "sequence", "flight_id"]
     return (
         rows.sort(order, nulls_last=False)
         .filter((pl.col("unit") == pl.col("unit").last().over(KEY)) & (timed | ~timed.any().over(KEY)))

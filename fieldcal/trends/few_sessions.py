@@ -13,9 +13,9 @@ import numpy as np
 from scipy import stats
 
 from fieldcal.geometry.rotation import Array
-from fieldcal.schemas.reference import REFERENCE_DEGC
+from fieldcal.schemas.reference import ENOUGH_SESSIONS, REFERENCE_DEGC
 from fieldcal.trends.regression import Trends
-from fieldcal.trends.series import ENOUGH_SESSIONS, Histories
+from fieldcal.trends.series import Histories
 from fieldcal.trends.siblings import ENOUGH_SIBLINGS, REFERENCE_LEVEL, outliers
 
 LEAST_SESSIONS = 2

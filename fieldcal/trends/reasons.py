@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from fieldcal.names import DriftStatus
-from fieldcal.schemas.reference import UNCONFIRMED_SD
+from fieldcal.schemas.reference import ENOUGH_SESSIONS, UNCONFIRMED_SD
 from fieldcal.schemas.rows import DriftRow
-from fieldcal.trends.series import ENOUGH_SESSIONS
 from fieldcal.words.numbers import number, with_sd
 
 VPS, AGREEMENT = "vps", "fit"

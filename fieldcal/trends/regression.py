@@ -20,9 +20,10 @@ from scipy import stats
 
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import DriftStatus
+from fieldcal.schemas.reference import ENOUGH_SESSIONS
 from fieldcal.trends.evidence import FALSE_ALARMS, MOST_STEPS, Evidence, evidence
 from fieldcal.trends.random_effects import fit_random_effects
-from fieldcal.trends.series import ENOUGH_SESSIONS, LEVEL, Histories, prepare
+from fieldcal.trends.series import LEVEL, Histories, prepare
 from fieldcal.trends.siblings import LEAST_FREEDOM, moderated_variance
 
 FALSE_OUTLIERS = 0.05

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fieldcal.geometry.rotation import Array
+from fieldcal.schemas.reference import ENOUGH_SESSIONS
 from fieldcal.trends.change_points import isolated, scatter_variance, temperature_slope
 from fieldcal.trends.random_effects import Grouping
 
-ENOUGH_SESSIONS = 5
-"""Fewer sessions than this are no trend: level, two slopes, and something left to judge them by."""
 TEMPERATURE_SPAN_DEGC = 2.0
 TIME_SPAN_DAY = 1.0
 FLOOR = 1e-6

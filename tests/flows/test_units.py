@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -290,3 +291,23 @@ def test_the_further_units_are_left_out_where_only_the_primary_ones_are_asked_fo
     assert set(rows["unit_id"]) == {units[0] for units in night.ids.values()}
     whole = night.warehouse.scan("calibration").filter(pl.col("is_primary")).collect()
     assert rows.drop("run_key").equals(whole.drop("run_key"))
+
+
+@pytest.mark.parametrize("night", ["mcap"], indirect=True)
+def test_another_imu_id_holds_for_new_flights_and_a_dated_one_for_all(night: Night, tmp_path: Path) -> None:
+    root = tmp_path / "warehouse"
+    shutil.copytree(night.root, root)
+    config = tmp_path / "fieldcal.toml"
+    text = (night.archive / "fieldcal.toml").read_text()
+
+    def units(imu_id: str) -> set[tuple[str, str]]:
+        config.write_text(text.replace("[vehicles.v]\n", f"[vehicles.v]\nimu_id = {imu_id}\n"))
+        assert run_night(night.archive, root, config)["stages_run"] == 0
+        rows = fieldcal.Warehouse(root).scan("calibration").select("imu_id", "unit_id").unique().collect()
+        return set(rows.rows())
+
+    others = ("//imu1", "//imu2", "//mag1")
+    assert units('"B"') == {("v", "v"), *(("v", f"v{other}") for other in others)}
+    later = '[{ id = "C" }, { id = "D", from = 2030-01-01 }]'
+    assert units(later) == {("C", "C"), *(("C", f"C{other}") for other in others)}
+    assert units('[{ id = "D", from = 2030-01-01 }]') == {("v", "v"), *(("v", f"v{other}") for other in others)}

@@ -123,14 +123,14 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for step in STEPS:
             work.run(step)
         facts = work.records["ingest"]["facts"]
-        leading = lead_of(job, vehicle.imu_id, facts)
+        leading = lead_of(job, job.vehicle_id, facts)
         tables = {
             f"{stage}.{name}": (StageStore(root).load(stage, job.flight_id, key, [name])[name], key)
             for stage, name in (source.split(".") for sources in PUBLISHED.values() for source in sources)
             for key in (work.records[stage]["run_key"],)
             if name in work.records[stage]["outputs"]
         }
-        units = units_of(facts, vehicle)
+        units = units_of(facts, vehicle, job.vehicle_id)
         history = published_tables([(leading, units[0], tables)])
         history["flight"] = rows_frame("flight", [flight_row(job, leading, facts)])
         history["run"] = rows_frame("run", run_rows(leading, units, work.records))

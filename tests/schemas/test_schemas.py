@@ -45,10 +45,10 @@ def test_keys_are_columns_and_names_unique_within_a_table() -> None:
 
 def test_history_tables_lead_with_flight_vehicle_imu_session_and_start() -> None:
     lead = tuple(column.name for column in columns.LEAD)
-    assert lead == ("flight_id", "vehicle_id", "imu_id", "session_id", "started_at")
+    assert lead == ("flight_id", "vehicle_id", "imu_id", "session_id", "started_at", "dated_by", "sequence")
     for name in schemas.HISTORY_TABLES:
         if name != "drift":
-            assert schemas.TABLES[name].column_names[:5] == lead
+            assert schemas.TABLES[name].column_names[:7] == lead
 
 
 def test_arrow_schema_carries_units_meanings_and_facts() -> None:
@@ -145,11 +145,11 @@ FORMS = {
     "held_out": (1, "b3e93959"),
     "covariance": (1, "95bf049d"),
     "vps_aligned": (1, "8f8b1e84"),
-    "flight": (1, "e2a4d5fc"),
-    "calibration": (2, "a07f34b9"),
-    "fit": (2, "584e4810"),
-    "sync": (2, "620282fd"),
-    "run": (2, "27debd78"),
+    "flight": (2, "22477831"),
+    "calibration": (2, "1829cb30"),
+    "fit": (2, "1e14d746"),
+    "sync": (2, "266ce3a5"),
+    "run": (2, "ac506f44"),
     "drift": (4, "e8fac4a1"),
 }
 """Version of every table and digest of its columns: only by its version is an older file known for one."""

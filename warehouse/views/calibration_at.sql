@@ -16,7 +16,7 @@ SELECT
             0
         )
     ) AS sd,
-    l.unit, l.flight_id, l.started_at, l.source, l.session_sd,
+    l.unit, l.flight_id, l.started_at, l.sequence, l.source, l.session_sd,
     concat(
         l.why,
         CASE

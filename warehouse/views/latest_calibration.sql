@@ -13,10 +13,10 @@ WITH latest AS (
         arg_max(
             struct_pack(
                 vehicle_id, imu_id, is_primary, method, value, sd, unit, at_degc := c.temperature_degc, flight_id,
-                started_at
+                started_at, sequence
             ),
             row(
-                coalesce(started_at, TIMESTAMPTZ '-infinity'), flight_id,
+                coalesce(started_at, TIMESTAMPTZ '-infinity'), coalesce(sequence, ''), flight_id,
                 CASE method {exactness} ELSE 0 END,
                 method
             )
@@ -28,7 +28,10 @@ WITH latest AS (
 beside AS (
     SELECT
         k.unit_id, k.sensor, k.parameter, k.axis, l, d,
-        d.value_at_25degc IS NOT NULL AND (d.status <> 'insufficient' OR d.borrowed_from IS NOT NULL) AS trend,
+        d.value_at_25degc IS NOT NULL AND (
+            d.status <> 'insufficient' AND coalesce(d.n_sessions, {enough_sessions}) >= {enough_sessions}
+            OR d.borrowed_from IS NOT NULL
+        ) AS trend,
         coalesce(
             d.slope_per_degc * (l.at_degc - {reference_degc})
             + coalesce(d.curve_per_degc2, 0) * (l.at_degc - {reference_degc}) ^ 2
@@ -77,7 +80,7 @@ SELECT
     CASE WHEN trend THEN d.slope_per_degc_sd END AS slope_per_degc_sd,
     CASE WHEN trend THEN d.curve_per_degc2 END AS curve_per_degc2,
     CASE WHEN trend THEN d.curve_per_degc3 END AS curve_per_degc3,
-    l.unit, l.at_degc AS temperature_degc, l.flight_id, l.started_at,
+    l.unit, l.at_degc AS temperature_degc, l.flight_id, l.started_at, l.sequence,
     CASE WHEN by_trend THEN 'drift' ELSE 'flight' END AS source,
     CASE WHEN by_trend THEN d.best_known_degc ELSE l.at_degc END AS best_known_degc,
     CASE WHEN trend THEN d.session_sd END AS session_sd,
