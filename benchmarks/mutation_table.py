@@ -63,6 +63,9 @@ _RCOND = "rounding and what is seen lie orders apart on either side"
 _ROUNDS = "another round of reweighting moves a small part of the standard deviation"
 _ENDS_MASKED = "the low-pass has masked the places at the ends"
 _TURNED = "which attitudes are also solved in frames that are turned by half; the result is the same"
+_START = "where the iteration starts; another start ends at the same minimum"
+_DIGITS = "a scale near that of the readings, for the digits alone"
+_SIGNS = "signs are 1 or -1, and a sum of three of them is odd"
 _DOWN = "another way down to the same minimum"
 
 EQUIVALENT: dict[tuple[str, str, str, str], str] = {
@@ -1083,5 +1086,242 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "theta = np.linalg.lstsq(flat / scale, (level * root).reshape(-1), rcond=1e-9)[0] / scale",
         "1 → 2",
     ): _ANY_NEGATIVE,
+    ("estimation.by_pose.constant_vector", "", "MAX_ITERATIONS = 30", "30 → 33"): _CONVERGED,
+    (
+        "estimation.by_pose.constant_vector",
+        "",
+        "CONVERGED_SHARE = 1e-9  # of the sum of squares",
+        "1e-09 → 1.1000000000000001e-09",
+    ): _CONVERGED,
+    (
+        "estimation.by_pose.constant_vector",
+        "",
+        "ROUNDING = 1e-18  # of a reading's square, which is of order one",
+        "1e-18 → 1.1000000000000001e-18",
+    ): _CONVERGED,
+    ("estimation.by_pose.constant_vector", "", "REGRESSION_ROUNDS = 4", "4 → 5"): _ROUNDS,
+    (
+        "estimation.by_pose.constant_vector",
+        "fit_constant_vector",
+        "centre, spread = x.mean(axis=0), float(max(x.std(axis=0).max(), 1e-300))",
+        "1e-300 → 1.1000000000000002e-300",
+    ): _GUARD,
+    (
+        "estimation.by_pose.constant_vector",
+        "fit_constant_vector",
+        "centre, spread = x.mean(axis=0), float(max(x.std(axis=0).max(), 1e-300))",
+        "max → min #2",
+    ): _DIGITS,
+    (
+        "estimation.by_pose.constant_vector",
+        "fit_constant_vector",
+        "centre, spread = x.mean(axis=0), float(max(x.std(axis=0).max(), 1e-300))",
+        "0 → 1 #2",
+    ): _DIGITS,
+    (
+        "estimation.by_pose.constant_vector",
+        "fit_constant_vector",
+        "if np.sum(np.sign(theta[[0, 4, 8]]) * np.asarray(polarity, dtype=float)) < 0:",
+        "< → <=",
+    ): _SIGNS,
+    (
+        "estimation.by_pose.constant_vector",
+        "fit_constant_vector",
+        "if np.sum(np.sign(theta[[0, 4, 8]]) * np.asarray(polarity, dtype=float)) < 0:",
+        "0 → 1 #2",
+    ): _SIGNS,
+    (
+        "estimation.by_pose.constant_vector",
+        "fit_constant_vector",
+        "if np.sum(np.sign(theta[[0, 4, 8]]) * np.asarray(polarity, dtype=float)) < 0:",
+        "* → /",
+    ): _SIGNS,
+    (
+        "estimation.by_pose.constant_vector",
+        "fit_constant_vector",
+        "covariance = covariance * np.outer(*[np.r_[-np.ones(9), np.ones(3), -np.ones(2), 1.0]] * 2)",
+        "* → /",
+    ): _SIGNS,
+    (
+        "estimation.by_pose.constant_vector",
+        "fit_constant_vector",
+        "covariance = covariance * np.outer(*[np.r_[-np.ones(9), np.ones(3), -np.ones(2), 1.0]] * 2)",
+        "without - #2",
+    ): "the field's covariance with the others is not told",
+    (
+        "estimation.by_pose.constant_vector",
+        "_blocks",
+        "block = np.unique(np.floor((t[at] - t[0]) / BLOCK_S) + 1e9 * segment[at], return_inverse=True)[1]",
+        "1000000000.0 → 1100000000.0",
+    ): "any number beyond those of the blocks",
+    ("estimation.by_pose.constant_vector", "_blocks.mean", "flat = v.reshape(len(v), -1)", "1 → 2"): _ANY_NEGATIVE,
+    (
+        "estimation.by_pose.constant_vector",
+        "_blocks.mean",
+        "return (sums / count[:, None]).reshape(-1, *v.shape[1:])",
+        "1 → 2",
+    ): _ANY_NEGATIVE,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "regressor = np.column_stack([turn.reshape(len(turn), 9), np.ones(len(turn))]) * root",
+        "* → /",
+    ): _START,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "coefficients = np.linalg.lstsq(regressor, x * root, rcond=1e-6)[0]",
+        "* → /",
+    ): _START,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "coefficients = np.linalg.lstsq(regressor, x * root, rcond=1e-6)[0]",
+        "1e-06 → 1.1e-06",
+    ): _RCOND,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "h = length * shared / np.linalg.norm(shared)",
+        "/ → *",
+    ): "a row of Vt has the length 1",
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "h = length * shared / np.linalg.norm(shared)",
+        "* → /",
+    ): _START,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "linear = np.column_stack([turn @ h, np.ones(len(turn))]) * root",
+        "* → /",
+    ): _START,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "solved = np.linalg.lstsq(linear, x * root, rcond=1e-9)[0]",
+        "* → /",
+    ): _START,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "solved = np.linalg.lstsq(linear, x * root, rcond=1e-9)[0]",
+        "1e-09 → 1.1000000000000001e-09",
+    ): _RCOND,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "now = float(np.sum(residual**2 * root**2))",
+        "* → /",
+    ): _CONVERGED,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "now = float(np.sum(residual**2 * root**2))",
+        "** → * #2",
+    ): _CONVERGED,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "now = float(np.sum(residual**2 * root**2))",
+        "2 → 3 #2",
+    ): _CONVERGED,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "if abs(cost - now) <= CONVERGED_SHARE * now + ROUNDING * len(x):",
+        "<= → <",
+    ): _CONVERGED,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "if abs(cost - now) <= CONVERGED_SHARE * now + ROUNDING * len(x):",
+        "* → /",
+    ): _CONVERGED,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "if abs(cost - now) <= CONVERGED_SHARE * now + ROUNDING * len(x):",
+        "* → / #2",
+    ): _CONVERGED,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "flat = (sensitivity * root[..., None]).reshape(-1, PARAMETERS)",
+        "1 → 2",
+    ): _ANY_NEGATIVE,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "scale = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)",
+        "maximum → minimum",
+    ): "columns are scaled for the digits alone",
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "scale = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)",
+        "1e-300 → 1.1000000000000002e-300",
+    ): _GUARD,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "step = np.linalg.lstsq(flat / scale, (residual * root).reshape(-1), rcond=1e-9)[0] / scale",
+        "1e-09 → 1.1000000000000001e-09",
+    ): _RCOND,
+    (
+        "estimation.by_pose.constant_vector",
+        "_minimised",
+        "step = np.linalg.lstsq(flat / scale, (residual * root).reshape(-1), rcond=1e-9)[0] / scale",
+        "1 → 2",
+    ): _ANY_NEGATIVE,
+    (
+        "estimation.by_pose.constant_vector",
+        "_across",
+        "return np.linalg.svd(h[None])[2][1:].T * np.linalg.norm(h)",
+        "* → /",
+    ): "the unit of two numbers that are not told",
+    (
+        "estimation.by_pose.gyroscope",
+        "start_by_rates",
+        "found = 1.0 / np.maximum(np.linalg.norm(m, axis=1), 1e-300)",
+        "1e-300 → 1.1000000000000002e-300",
+    ): _GUARD,
+    (
+        "estimation.by_pose.gyroscope",
+        "start_by_rates",
+        "if np.max(np.abs(stretch - 1.0)) > LARGEST_STRETCH or angle < OTHER_MOUNTING_RAD:",
+        "> → >=",
+    ): _NEVER_MET,
+    (
+        "estimation.by_pose.gyroscope",
+        "start_by_rates",
+        "if np.max(np.abs(stretch - 1.0)) > LARGEST_STRETCH or angle < OTHER_MOUNTING_RAD:",
+        "< → <=",
+    ): _NEVER_MET,
+    (
+        "estimation.by_pose.gyroscope",
+        "_trusted",
+        "agrees = float(difference @ np.linalg.solve(larger[:3, :3], difference)) < AGREEMENT_CHI2",
+        "< → <=",
+    ): _NEVER_MET,
+    (
+        "estimation.by_pose.gyroscope",
+        "attitudes",
+        "seen = (on_vps_clock >= t_vps[0]) & (on_vps_clock <= t_vps[-1]) & (t_vps[at + 1] - t_vps[at] <= max_gap_s)",
+        "<= → < #2",
+    ): _NEVER_MET,
+    (
+        "estimation.by_pose.gyroscope",
+        "attitudes",
+        "seen = (on_vps_clock >= t_vps[0]) & (on_vps_clock <= t_vps[-1]) & (t_vps[at + 1] - t_vps[at] <= max_gap_s)",
+        ">= → >",
+    ): _NEVER_MET,
+    (
+        "estimation.by_pose.level",
+        "ned_from_world",
+        "s = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])",
+        "without -",
+    ): "the axis of the shortest turn is level: this is 0",
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

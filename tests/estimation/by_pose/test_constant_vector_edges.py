@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -10,7 +12,7 @@ from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation.by_pose import constant_vector
 from fieldcal.estimation.by_pose.constant_vector import fit_constant_vector
 from fieldcal.estimation.by_pose.triad import TriadByPose
-from fieldcal.estimation.statistics import colour
+from fieldcal.estimation.statistics import colour, least_squares_covariance
 from fieldcal.geometry.rotation import Array, body_from_inertial, from_rotation_vector
 
 FIELD = np.array([0.2, 0.05, 0.43])
@@ -48,22 +50,33 @@ def all_of(fit: TriadByPose) -> Array:
     return np.r_[fit.matrix.ravel(), fit.bias]
 
 
+def across_of(field: Array) -> Array:
+    """Two directions across a field, (3, 2)."""
+    return np.stack([np.cross(field, [1.0, 0.0, 0.0]), np.cross(field, [0.0, 1.0, 0.0])], axis=1)
+
+
+def misses(t: Array, logged: Array, field: Array) -> Callable[[Array], Array]:
+    """What (matrix, bias, two turns of the field, delay) (15,) leave of every block's mean reading."""
+    x = logged.reshape(-1, BLOCK, 3).mean(axis=1)
+
+    def left(v: Array) -> Array:
+        h = field + across_of(field) @ v[12:14]
+        late = body_from_inertial(attitude(t - v[14])) @ (h * LENGTH / np.linalg.norm(h))
+        read = (late - v[9:12]) @ np.linalg.inv(v[:9].reshape(3, 3)).T
+        return np.asarray(read.reshape(-1, BLOCK, 3).mean(axis=1) - x).ravel()
+
+    return left
+
+
 def test_estimate_and_sd_are_those_of_a_least_squares_of_another_library() -> None:
     """In the published numbers themselves (matrix, bias, field, delay), by SciPy from the truth, block by block; sd by
     its Jacobian and the noise that was drawn."""
     claimed, of_field, off = [], [], []
-    across = np.stack([np.cross(FIELD, [1.0, 0.0, 0.0]), np.cross(FIELD, [0.0, 1.0, 0.0])], axis=1)
+    across = across_of(FIELD)
     for seed in range(6):
         t, logged = readings(seed, late_s=0.0)
         fit, field, covariance = fitted(t, logged)
-        x = logged.reshape(-1, BLOCK, 3).mean(axis=1)
-
-        def left(v: Array, t: Array = t, x: Array = x) -> Array:
-            h = FIELD + across @ v[12:14]
-            late = body_from_inertial(attitude(t - v[14])) @ (h * LENGTH / np.linalg.norm(h))
-            read = (late - v[9:12]) @ np.linalg.inv(v[:9].reshape(3, 3)).T
-            return np.asarray(read.reshape(-1, BLOCK, 3).mean(axis=1) - x).ravel()
-
+        left = misses(t, logged, FIELD)
         start = np.r_[MATRIX.ravel(), BIAS, np.zeros(3)]
         own = least_squares(left, start, x_scale="jac")
         cramer_rao = np.linalg.inv(own.jac.T @ own.jac) * NOISE**2 / BLOCK
@@ -110,13 +123,18 @@ def test_the_other_polarity_is_the_opposite_field() -> None:
     np.testing.assert_allclose(other.covariance / np.outer(sd, sd), one.covariance / np.outer(sd, sd), atol=1e-6)
     np.testing.assert_allclose(same, covariance, rtol=1e-6, atol=1e-15)
     assert np.sign(np.diagonal(one.matrix)).tolist() == POLARITY.tolist()
+    assert (other.delay_s, other.delay_sd_s) == pytest.approx((one.delay_s, one.delay_sd_s), rel=1e-6)
 
 
-def test_two_of_three_signs_decide() -> None:
-    """A triad whose z axis is turned round beside the configuration."""
+@pytest.mark.parametrize("wrong", [0, 1, 2])
+def test_two_of_three_signs_decide(wrong: int) -> None:
+    """A triad of which one axis is turned round beside the configuration; and one of which two are."""
     t, logged = readings(6)
-    fit, field, _ = fitted(t, logged, np.ones(3))
-    assert (field @ FIELD > 0.0, fit.matrix[2, 2] < 0.0) == (True, True)
+    polarity = np.where(np.arange(3) == wrong, -POLARITY, POLARITY)
+    for sign in (1.0, -1.0):
+        fit, field, _ = fitted(t, logged, sign * polarity)
+        assert np.sign(field @ FIELD) == sign
+        assert np.sign(np.diagonal(fit.matrix)).tolist() == (sign * POLARITY).tolist()
 
 
 @pytest.mark.parametrize(("blocks", "enough"), [(100, True), (99, False)])
@@ -149,7 +167,7 @@ def test_a_fit_that_does_not_settle_is_refused(monkeypatch: pytest.MonkeyPatch) 
 def test_blocks_are_means_of_what_is_read_and_known_in_them() -> None:
     """By a loop over 1/20 s from the first stamp on: two segments that meet within a block, readings with a part
     missing, attitudes that are not known; the slope of a straight line, none where fewer than five readings are."""
-    t = np.arange(400) / 131.0 + 0.5
+    t = np.arange(400) / 131.0 + 0.512
     segment = (np.arange(400) >= 150).astype(np.int64) + (np.arange(400) >= 300) + (np.arange(400) >= 304)
     slope = np.array([1.0, -2.0, 0.5])
     logged, q = slope * t[:, None] + 0.1, attitude(t)
@@ -191,3 +209,30 @@ def test_what_is_told_is_of_the_weighed_blocks() -> None:
     read = residual @ np.linalg.inv(MATRIX).T * np.sqrt(fit.weight)[:, None]
     assert fit.colour == pytest.approx(colour(read), rel=0.02)
     assert np.abs(fit.matrix - MATRIX).max() < 0.01
+
+
+def test_a_wrong_block_is_told_on_the_quietest_axis() -> None:
+    """Forty sd of the quiet axis, two of the loud ones."""
+    t, _ = readings(10)
+    sd = np.array([0.002, 0.04, 0.04])
+    logged = (body_from_inertial(attitude(t)) @ FIELD - BIAS) @ np.linalg.inv(MATRIX).T
+    logged += np.sqrt(BLOCK) * sd * np.random.default_rng(1).normal(size=logged.shape)
+    logged.reshape(-1, BLOCK, 3)[::20, :, 0] += 0.08
+    weight = fitted(t, logged)[0].weight
+    assert weight[::20].max() < 0.5
+    assert np.median(weight) > 0.9
+
+
+def test_sd_beside_wrong_blocks_are_by_their_definition() -> None:
+    """Derivatives of the published numbers by SciPy's differences, all of it weighed."""
+    t, logged = readings(11, late_s=0.0)
+    logged.reshape(-1, BLOCK, 3)[::20] += 0.1 * np.where(np.arange(30) % 2, 1.0, -1.0)[:, None, None]
+    fit, field, _ = fitted(t, logged)
+    assert fit.weight[::20].max() < 0.1
+    left = misses(t, logged, field)
+    found = least_squares(left, np.r_[all_of(fit), 0.0, 0.0, fit.delay_s], x_scale="jac", max_nfev=1)
+    root = np.sqrt(fit.weight)[:, None]
+    sensitivity, residual = found.jac.reshape(-1, 3, 15), found.fun.reshape(-1, 3)
+    expected = least_squares_covariance(sensitivity * root[..., None], residual * root)[1]
+    np.testing.assert_allclose(np.diagonal(fit.covariance), np.diagonal(expected)[:12], rtol=0.1)
+    assert fit.delay_sd_s == pytest.approx(np.sqrt(expected[14, 14]), rel=0.05)

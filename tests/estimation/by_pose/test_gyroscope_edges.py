@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +16,7 @@ from fieldcal.estimation.by_pose import gyroscope
 from fieldcal.estimation.by_pose.gyroscope import attitudes, start_by_rates
 from fieldcal.estimation.clock_sync.by_rates import SyncFit
 from fieldcal.estimation.joint.problem import Readings
+from fieldcal.estimation.joint.variance_components import Levels
 from fieldcal.geometry.rotation import Array, body_from_inertial, conjugate, from_rotation_vector, multiply, propagate
 from fieldcal.simulation.experiment import simulate
 
@@ -155,6 +157,61 @@ def test_a_gap_is_carried_over_by_the_gyroscope() -> None:
     off = errors(*given, bias=BIASED_RADPS)
     assert off.max() < 0.25 * np.sqrt(3.0) * BIASED_RADPS * 3.0 * 2.0
     assert off[1900] > 10.0 * INTERPOLATED_RAD
+
+
+def test_the_gyroscope_s_own_bias_is_taken_off() -> None:
+    own, q, t_vps, q_vps, clock = flown()
+    biased = replace(own, gyroscope=own.gyroscope - BIASED_RADPS / 0.5)
+    kept = (t_vps < t_vps[800]) | (t_vps > t_vps[1100])
+    assert errors(biased, q, t_vps[kept], q_vps[kept], clock, bias=BIASED_RADPS).max() < INTERPOLATED_RAD
+
+
+def test_the_first_pose_holds_where_a_gap_follows_it() -> None:
+    own, q, t_vps, q_vps, clock = flown()
+    kept = (t_vps < t_vps[3]) | (t_vps > t_vps[300])
+    off = errors(own, q, t_vps[kept], q_vps[kept], clock, bias=BIASED_RADPS)
+    assert off[:4].max() < 0.02 * BIASED_RADPS * 3.0
+
+
+def test_a_gap_between_two_stretches_is_either_s_own() -> None:
+    """A stretch's attitude begins anew: what lies in the gap is turned as the poses of its own stretch are."""
+    own, q, t_vps, q_vps, clock = flown((np.arange(4000) >= 3000).astype(np.int64))
+    kept = (t_vps < t_vps[1450]) | (t_vps > t_vps[1550])
+    assert errors(own, q, t_vps[kept], q_vps[kept], clock).max() < INTERPOLATED_RAD
+
+
+def test_hardly_any_rotation_is_none() -> None:
+    """Rounding of its cosine beyond one is no rotation either."""
+    for seed in range(100):
+        turn = body_from_inertial(from_rotation_vector(1e-9 * np.random.default_rng(seed).normal(size=3)))
+        assert start_by_rates(turn, POSITIVE, UNIT)[1].tolist() == np.eye(3).tolist()
+
+
+def test_the_walk_is_held_down_for_one_of_two_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first may be ten times the walk by the gyroscope's noise, the second 0.03 of it, from where that ended; no
+    vector stands beside them: no dip, no lever arm."""
+    asked: list[dict[str, Any]] = []
+
+    def fit_joint(model: Any, state: Any, **how: Any) -> Any:
+        asked.append({"model": model, "state": state, **how})
+        levels = Levels(np.ones(0), np.ones(0), np.ones(0), 1.0, 1.0)
+        return SimpleNamespace(state=state, levels=levels, constants=fit(np.ones(3), np.ones(3)).constants)
+
+    monkeypatch.setattr(gyroscope, "fit_joint", fit_joint)
+    own, _, t_vps, q_vps, clock = flown()
+    noise = 1e-3 * np.random.default_rng(1).normal(size=own.gyroscope.shape)
+    start = np.full(3, 0.5), np.zeros(3)
+    noisy = replace(own, gyroscope=own.gyroscope + noise)
+    gyroscope.fit_gyroscope(noisy, t_vps, q_vps, clock, start, np.eye(3), max_gap_s=0.05)
+    free, stiff = asked
+    assert (free["largest_walk_ratio"], stiff["largest_walk_ratio"]) == (10.0, 0.03)
+    assert [how[name] for how in asked for name in ("free_dip", "try_lever_arm")] == [False] * 4
+    # White noise of 0.5 · 1e-3 rad/s every 5 ms; the largest of three axes.
+    assert stiff["levels"].walk == pytest.approx(0.03 * (0.5e-3) ** 2 * 0.005, rel=0.15)
+    assert free["model"].vectors == ()
+    assert {name: x.shape for name, x in free["state"].values.items()} == {
+        "dip": (1,), "lever_arm": (3,), "gyroscope": (6,), "vps_clock": (2,), "vps_world": (3,), "vps_body": (3,),
+    }  # fmt: skip
 
 
 def test_before_and_after_the_poses_the_gyroscope_goes_on() -> None:
