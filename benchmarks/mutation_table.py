@@ -64,6 +64,7 @@ _ROUNDS = "another round of reweighting moves a small part of the standard devia
 _ENDS_MASKED = "the low-pass has masked the places at the ends"
 _TURNED = "which attitudes are also solved in frames that are turned by half; the result is the same"
 _START = "where the iteration starts; another start ends at the same minimum"
+_STEP = "the step of a central difference, far from where rounding or curvature count"
 _DIGITS = "a scale near that of the readings, for the digits alone"
 _SIGNS = "signs are 1 or -1, and a sum of three of them is odd"
 _DOWN = "another way down to the same minimum"
@@ -1323,5 +1324,49 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "s = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])",
         "without -",
     ): "the axis of the shortest turn is level: this is 0",
+    (
+        "estimation.by_pose.triad",
+        "",
+        "DIFFERENCE_SHARE = 1e-6  # of a matrix element, for the derivatives of a decomposition",
+        "1e-06 → 1.1e-06",
+    ): _STEP,
+    (
+        "estimation.by_pose.triad",
+        "TriadByPose.cross_test",
+        "return float(value @ np.linalg.lstsq(self.covariance[np.ix_(at, at)], value, rcond=1e-12)[0])",
+        "1e-12 → 1.1000000000000002e-12",
+    ): _RCOND,
+    (
+        "estimation.by_pose.triad",
+        "TriadByPose.square",
+        "gain = np.linalg.lstsq(covariance[np.ix_(at, at)], covariance[at], rcond=1e-12)[0].T",
+        "1e-12 → 1.1000000000000002e-12",
+    ): _RCOND,
+    (
+        "estimation.by_pose.triad",
+        "axis_sigma",
+        "return np.maximum([robust_sigma(r) for r in residual.T], 1e-12)",
+        "1e-12 → 1.1000000000000002e-12",
+    ): _GUARD,
+    ("estimation.by_pose.triad", "body_axes.lower", "q, left = q * signs, left * signs[:, None]", "* → /"): _SIGNS,
+    ("estimation.by_pose.triad", "body_axes.lower", "q, left = q * signs, left * signs[:, None]", "* → / #2"): _SIGNS,
+    (
+        "estimation.by_pose.triad",
+        "body_axes",
+        "step = DIFFERENCE_SHARE * np.maximum(np.abs(at), np.r_[np.full(9, np.abs(triad.matrix).max()), np.ones(3)])",
+        "* → /",
+    ): _STEP,
+    (
+        "estimation.by_pose.triad",
+        "body_axes",
+        "step = DIFFERENCE_SHARE * np.maximum(np.abs(at), np.r_[np.full(9, np.abs(triad.matrix).max()), np.ones(3)])",
+        "maximum → minimum",
+    ): _STEP,
+    (
+        "estimation.by_pose.triad",
+        "body_axes",
+        "step = DIFFERENCE_SHARE * np.maximum(np.abs(at), np.r_[np.full(9, np.abs(triad.matrix).max()), np.ones(3)])",
+        "max → min",
+    ): _STEP,
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

@@ -182,11 +182,16 @@ def test_a_gap_between_two_stretches_is_either_s_own() -> None:
     assert errors(own, q, t_vps[kept], q_vps[kept], clock).max() < INTERPOLATED_RAD
 
 
-def test_hardly_any_rotation_is_none() -> None:
-    """Rounding of its cosine beyond one is no rotation either."""
-    for seed in range(100):
-        turn = body_from_inertial(from_rotation_vector(1e-9 * np.random.default_rng(seed).normal(size=3)))
-        assert start_by_rates(turn, POSITIVE, UNIT)[1].tolist() == np.eye(3).tolist()
+def test_hardly_any_rotation_is_none_and_half_a_turn_is_one() -> None:
+    """Whichever way their cosines are rounded, beyond one too."""
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        stretched = np.diag(1.0 + rng.uniform(-0.2, 0.2, 3)) + 1e-9 * rng.normal(size=(3, 3))
+        axis = rng.normal(size=3)
+        half = 2.0 * np.outer(axis, axis) / (axis @ axis) - np.eye(3)
+        with np.errstate(invalid="raise"):
+            assert start_by_rates(stretched, POSITIVE, UNIT)[1].tolist() == np.eye(3).tolist()
+            assert start_by_rates(half, POSITIVE, UNIT)[1] == pytest.approx(half)
 
 
 def test_the_walk_is_held_down_for_one_of_two_fits(monkeypatch: pytest.MonkeyPatch) -> None:
