@@ -1368,5 +1368,29 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "step = DIFFERENCE_SHARE * np.maximum(np.abs(at), np.r_[np.full(9, np.abs(triad.matrix).max()), np.ones(3)])",
         "max → min",
     ): _STEP,
+    (
+        "estimation.joint.problem",
+        "averaging_side",
+        "longest = min(MAX_TURN_RAD / max(rate_radps, 1e-9), MAX_AVERAGE_S)",
+        "1e-09 → 1.1000000000000001e-09",
+    ): _GUARD,
+    (
+        "estimation.joint.problem",
+        "Centred.of",
+        "spread = np.maximum(logged[valid].std(axis=0), 1e-300)",
+        "1e-300 → 1.1000000000000002e-300",
+    ): _GUARD,
+    (
+        "estimation.joint.problem",
+        "Centred.averaged",
+        "x = sum(self.x[at + k] for k in range(-side, side + 1)) / (2 * side + 1)",
+        "+ → -",
+    ): "the same neighbours from the other side",
+    (
+        "estimation.joint.problem",
+        "Model.valid_rows",
+        "return np.array([self.triads[name].valid for name in self.vectors], dtype=bool).reshape(-1, len(self.at)).T",
+        "1 → 2",
+    ): _ANY_NEGATIVE,
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

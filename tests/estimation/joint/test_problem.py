@@ -57,6 +57,8 @@ def test_a_part_is_every_array_s() -> None:
         (1.0 / 256.0, 0.0, 2),
         (1.0 / 256.0, 10.0, 0),  # 10 ms: 2.56 samples
         (1.0 / 256.0, 8.0, 1),  # 12.5 ms: 3.2 samples
+        (1.0 / 256.0, 8.4, 1),  # 3.05 samples
+        (1.0 / 256.0, 9.0, 0),  # 2.84 samples
         (1.0 / 512.0, 1.0, 4),  # 10.24 samples
         (1.0 / 32.0, 1.0, 0),
     ],
@@ -120,6 +122,9 @@ def test_rows_are_means_of_neighbours_within_a_segment() -> None:
 def test_a_triad_without_a_reading_is_left_out() -> None:
     given = readings(magnetometer=np.full((100, 3), np.nan))
     assert Model.of(given, place_knots(given.t, given.segment, 0.1)).vectors == ("accelerometer",)
+    assert given.magnetometer is not None
+    given.magnetometer[7] = 1.0
+    assert Model.of(given, place_knots(given.t, given.segment, 0.1)).vectors == TRIADS[1:]
 
 
 def test_valid_rows_are_in_the_order_of_the_vectors() -> None:
