@@ -65,6 +65,7 @@ _ENDS_MASKED = "the low-pass has masked the places at the ends"
 _TURNED = "which attitudes are also solved in frames that are turned by half; the result is the same"
 _START = "where the iteration starts; another start ends at the same minimum"
 _STEP = "the step of a central difference, far from where rounding or curvature count"
+_SHORT = "no record is that short: it has some rows a second, over seconds"
 _DIGITS = "a scale near that of the readings, for the digits alone"
 _SIGNS = "signs are 1 or -1, and a sum of three of them is odd"
 _DOWN = "another way down to the same minimum"
@@ -1392,5 +1393,113 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "return np.array([self.triads[name].valid for name in self.vectors], dtype=bool).reshape(-1, len(self.at)).T",
         "1 → 2",
     ): _ANY_NEGATIVE,
+    (
+        "estimation.joint.variance_components",
+        "first_levels",
+        'row = 3 * model.vectors.index("accelerometer")',
+        "3 → 4",
+    ): "the accelerometer comes first",
+    (
+        "estimation.joint.variance_components",
+        "renewed_levels",
+        "square, free, information = np.maximum(squares.T, 1e-9)",
+        "1e-09 → 1.1000000000000001e-09",
+    ): _GUARD,
+    (
+        "estimation.joint.variance_components",
+        "renewed_levels",
+        "number = np.where(square < free, np.minimum(information, free), free)",
+        "< → <=",
+    ): _SAME_AT_THE_EDGE,
+    (
+        "estimation.joint.variance_components",
+        "robust_weight",
+        "row = slice(3 * i, 3 * i + 3)",
+        "3 → 4 #2",
+    ): "rows end with the second triad",
+    (
+        "estimation.joint.variance_components",
+        "robust_weight",
+        "weight = np.minimum(1.0, CLIP_SD**2 / np.maximum(square, 1e-12)) ** 2 * model.triads[name].valid",
+        "1e-12 → 1.1000000000000002e-12",
+    ): _GUARD,
+    (
+        "estimation.joint.variance_components",
+        "passing_fields",
+        'outlier = valid & (weight[:, 3 * vectors.index("magnetometer")] < OUTLIER_WEIGHT)',
+        "3 → 4",
+    ): "the axes of a triad have one weight",
+    (
+        "estimation.joint.variance_components",
+        "slow_colour",
+        "interval_s = float(np.sum(model.knots.interval_s * model.knots.joined)) / max(len(residual), 1)",
+        "1 → 2",
+    ): _SHORT,
+    (
+        "estimation.joint.variance_components",
+        "slow_colour",
+        "lags = int(np.clip(COLOUR_S / interval_s, 1, max(len(residual) // 4, 1)))",
+        "1 → 2",
+    ): _SHORT,
+    (
+        "estimation.joint.variance_components",
+        "slow_colour",
+        "lags = int(np.clip(COLOUR_S / interval_s, 1, max(len(residual) // 4, 1)))",
+        "1 → 2 #2",
+    ): _SHORT,
+    (
+        "estimation.joint.variance_components",
+        "_colour",
+        "size = fft.next_fast_len(len(x) + lags + 1, real=True)",
+        "1 → 2",
+    ): _LENGTH,
+    (
+        "estimation.joint.variance_components",
+        "_colour",
+        "size = fft.next_fast_len(len(x) + lags + 1, real=True)",
+        "True → False",
+    ): _LENGTH,
+    (
+        "estimation.joint.variance_components",
+        "_colour",
+        "by_triad = correlation.reshape(lags + 1, -1, 3).sum(axis=2)",
+        "1 → 2 #2",
+    ): _ANY_NEGATIVE,
+    (
+        "estimation.joint.variance_components",
+        "_colour",
+        "colour = 1.0 + 2.0 * (taper @ by_triad[1:]) / np.maximum(by_triad[0], 1e-300)",
+        "1e-300 → 1.1000000000000002e-300",
+    ): _GUARD,
+    (
+        "estimation.joint.covariance",
+        "covariance",
+        "variance = float(np.mean(left[left != 0.0] ** 2)) if left.any() else 1.0",
+        "1.0 → 1.1",
+    ): _OVER_ZEROS,
+    (
+        "estimation.joint.covariance",
+        "inverse_information",
+        "scale = 1.0 / np.sqrt(np.diagonal(information))",
+        "1.0 → 1.1",
+    ): _DIGITS,
+    (
+        "estimation.joint.covariance",
+        "inverse_information",
+        "return np.asarray(np.linalg.pinv(information * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale))",
+        "True → False",
+    ): _ALGORITHM,
+    (
+        "estimation.joint.covariance",
+        "advice",
+        "weak += [(float(sd), name, i) for i, sd in enumerate(relative) if sd > ADVICE_RELATIVE_SD]",
+        "> → >=",
+    ): _NEVER_MET,
+    (
+        "estimation.joint.covariance",
+        "advice",
+        'level = name == "magnetometer" and abs(float(state.values["dip"][0])) < STEEP_FIELD_RAD',
+        "< → <=",
+    ): _NEVER_MET,
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

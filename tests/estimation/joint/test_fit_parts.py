@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from small_record import ARM, CENTRE, PLACES, SPREAD, VALUES, Small, mixed, size_of, small
+from test_score_corrections import Flight
 
 from fieldcal.errors import EstimationError
 from fieldcal.estimation.joint import fit as joint_fit
@@ -23,7 +24,7 @@ TERMS = tuple(f"{name}_cross" for name in TRIADS)
 STEP = 1e-6
 
 
-def made(flight: Small, *, covariance: Array | None = None, **changes: Any) -> JointFit:
+def made(flight: Small | Flight, *, covariance: Array | None = None, **changes: Any) -> JointFit:
     """A fit of the record at its truth with a covariance as given."""
     layout, p = layout_of(flight.model, flight.state.values, dip=True, lever_arm=True)
     root = np.random.default_rng(1).normal(size=(p, p))
@@ -263,7 +264,7 @@ def test_rows_of_a_slow_colour_are_fitted_again(monkeypatch: pytest.MonkeyPatch)
     script = Script(monkeypatch, small())
     script.slow = True
     script.run()
-    assert [(spent, how.slow) for *_, spent, how in script.asked] == [(0, False), (5, True)]
+    assert [(spent, how.slow, how.walk_ratio) for *_, spent, how in script.asked] == [(0, False, 10.0), (5, True, 10.0)]
     alone = Script(monkeypatch, small(vectors=()))
     alone.slow = True
     alone.run()

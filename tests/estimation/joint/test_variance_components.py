@@ -69,6 +69,8 @@ def test_levels_start_from_the_residuals() -> None:
     scale = np.abs(flight.state.values["accelerometer"][:3])
     assert found.strength == pytest.approx(np.max(np.sqrt(found.variance[:3]) * scale))
     assert first_levels(own, flight.state, path, 1e-2 * left).strength == 0.2
+    alone = replace(own, vectors=("accelerometer",))
+    assert first_levels(alone, flight.state, path, left[:, :3]).strength == found.strength
     assert first_levels(own, flight.state, path, 0.0 * left).variance.tolist() == [1e-8] * 6
 
 
@@ -175,11 +177,13 @@ def test_a_reading_loses_weight_beyond_four_sd(vectors: tuple[str, ...]) -> None
     left = np.zeros((len(own.at), r))
     d = np.linspace(0.0, 12.0, len(own.at))
     way = np.array([2.0, -1.0, 2.0]) / 3.0
-    for i, name in enumerate(vectors):
+    for i in range(len(vectors)):
         row = slice(3 * i, 3 * i + 3)
-        left[:, row] = d[:, None] * way * np.sqrt(before.variance[row])
+        left[:, row] = np.roll(d, 50 * i)[:, None] * way * np.sqrt(before.variance[row])
+    for i, name in enumerate(vectors):
+        row, own_d = slice(3 * i, 3 * i + 3), np.roll(d, 50 * i)
         weight = robust_weight(own, left, before)[:, row]
-        expected = np.where(d <= 4.0, 1.0, (4.0 / np.maximum(d, 1.0)) ** 4) * own.triads[name].valid
+        expected = np.where(own_d <= 4.0, 1.0, (4.0 / np.maximum(own_d, 1.0)) ** 4) * own.triads[name].valid
         for axis in range(3):
             np.testing.assert_allclose(weight[:, axis], expected, rtol=1e-9)
 
@@ -190,7 +194,7 @@ def test_a_magnetometer_s_edge_is_told_by_the_mean_over_an_interval() -> None:
     own = model()
     together = len(own.at) // len(own.knots.index)
     assert together > 4
-    left = np.full((len(own.at), 6), 2.0 / np.sqrt(3.0))
+    left = np.tile(np.tile([4.0 / 3.0, 0.0, -np.sqrt(20.0) / 3.0], 2), (len(own.at), 1))
     for within in (1.0, 2.0):
         before = levels(variance=np.ones(6), colour_within=np.full(6, within))
         weight = robust_weight(own, left, before)
@@ -209,8 +213,8 @@ def test_a_passing_field_is_a_run_of_outliers_and_its_edges() -> None:
     """A quarter of its length on either side; a run of three has none, and is no passing field."""
     own = model()
     n = len(own.at)
-    run = [*range(50, 58), *range(100, 103), *range(120, 124), *range(n - 9, n)]
-    expected = [*range(48, 60), *range(119, 125), *range(n - 11, n)]
+    run = [*range(50, 61), *range(100, 103), *range(120, 124), *range(n - 9, n)]
+    expected = [*range(48, 63), *range(119, 125), *range(n - 11, n)]
     assert np.flatnonzero(passing_fields(own, weights(own, run))).tolist() == expected
     assert np.flatnonzero(passing_fields(own, weights(own, [*range(8)]))).tolist() == [*range(10)]
     assert not passing_fields(own, weights(own, run, 0.25)).any()
@@ -269,16 +273,35 @@ def test_colour_is_that_of_the_weighed_residuals_over_half_an_interval_and_over_
 
 
 def test_colour_is_looked_for_over_three_seconds_and_eight_rows_and_no_further() -> None:
-    """A record of some ten seconds, whose intervals have twenty rows."""
+    """A record of twenty seconds, whose intervals have forty rows; so many that a transform would wrap if it were one
+    shorter."""
+    n = 4042  # with eight lags, less one, 4050 = 2 · 3⁴ · 5²
     own = small(missing=False).model
-    rows = np.arange(2000)
-    interval_s = np.full(100, 0.1)
-    knots = replace(own.knots, index=np.arange(101), joined=np.ones(100, dtype=bool), interval_s=interval_s)
-    long = replace(own, at=rows, knots=knots)
-    x = np.cumsum(np.random.default_rng(5).normal(size=(2000, 6)), axis=0)
-    one = np.ones((2000, 6))
-    np.testing.assert_allclose(colour_within(long, x, one), np.minimum(tapered(x, 8), 10.0), rtol=1e-9)
-    np.testing.assert_allclose(slow_colour(long, x, one), np.minimum(tapered(x, 600), 400.0), rtol=1e-9)
+    knots = replace(
+        own.knots, index=np.arange(101), joined=np.ones(100, dtype=bool), interval_s=np.full(100, n / 20002.0)
+    )
+    long = replace(own, at=np.arange(n), knots=knots)
+    x = np.random.default_rng(5).normal(size=(n, 6))
+    x[0] += 30.0
+    x[-1] += 30.0
+    for i in range(1, n):
+        x[i] += 0.95 * x[i - 1]
+    one = np.ones((n, 6))
+    np.testing.assert_allclose(colour_within(long, x, one), tapered(x, 8), rtol=1e-9)
+    np.testing.assert_allclose(slow_colour(long, x, one), tapered(x, 600), rtol=1e-9)
+    assert tapered(x, 8).max() < 10.0
+
+
+def test_intervals_of_a_single_row() -> None:
+    """There the mean over an interval is the reading, and colour is looked for over one lag."""
+    own = small(missing=False, rate_hz=40.0, spacing_s=0.026).model
+    assert len(own.at) < 2 * len(own.knots.index)
+    left = np.random.default_rng(8).normal(size=(len(own.at), 6))
+    weight = robust_weight(own, left, levels(variance=np.full(6, 0.04)))
+    square = np.sum(left[:, 3:] ** 2, axis=1) / 0.04
+    np.testing.assert_allclose(weight[:, 4], np.minimum(1.0, 16.0 / square) ** 2)
+    one = np.ones_like(left)
+    np.testing.assert_allclose(colour_within(own, left, one), np.maximum(tapered(left, 1), 1.0), rtol=1e-9)
 
 
 def test_colour_has_a_bound() -> None:
