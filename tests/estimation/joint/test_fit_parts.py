@@ -9,19 +9,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numerics_support import turning_rates
 from small_record import ARM, CENTRE, PLACES, SPREAD, VALUES, Small, mixed, size_of, small
-from test_score_corrections import Flight
+from test_score_corrections import Flight, stamps
 
 from fieldcal.errors import EstimationError
 from fieldcal.estimation.joint import fit as joint_fit
-from fieldcal.estimation.joint.chain_solver import GRADIENT, Normal
+from fieldcal.estimation.joint.chain_solver import GRADIENT, Normal, whitened_motion
 from fieldcal.estimation.joint.fit import JointFit, Options, fit_joint
-from fieldcal.estimation.joint.measurement_model import layout_of, trajectory
-from fieldcal.estimation.joint.problem import TRIADS, PriorConstants, State
-from fieldcal.geometry.rotation import Array
+from fieldcal.estimation.joint.measurement_model import body_jumps, layout_of, trajectory
+from fieldcal.estimation.joint.problem import TRIADS, Model, PriorConstants, State
+from fieldcal.geometry.rotation import Array, from_rotation_vector, multiply
 
 TERMS = tuple(f"{name}_cross" for name in TRIADS)
 STEP = 1e-6
+SETTLED_SD = 0.1  # a step below this share of its sd is none
 
 
 def made(flight: Small | Flight, *, covariance: Array | None = None, **changes: Any) -> JointFit:
@@ -298,3 +300,121 @@ def test_places_and_sizes_are_those_of_the_layout() -> None:
     layout: Mapping[str, slice] = made(small(TERMS)).layout
     assert all(columns.stop - columns.start == size_of(name) for name, columns in layout.items())
     assert all(len(PLACES[name]) == size_of(f"{name}_cross") for name in TRIADS)
+
+
+def flown(seconds: float = 6.0, seed: int = 1) -> tuple[Flight, Model, State]:
+    """A record of every motion with noise and translation, and its true state."""
+    t = stamps(seconds)
+    flight = Flight.of(t, turning_rates(t, np.random.default_rng(seed), peak=1.5), gyro_noise=0.5)
+    model, state = flight.drawn(np.random.default_rng(seed))[0]
+    return flight, model, state
+
+
+def off_from(model: Model, state: State, *, turn_rad: float, relative: float) -> State:
+    """Every attitude turned, every scale longer, no translation: where a fit may start."""
+    rng = np.random.default_rng(7)
+    turns = turn_rad * rng.normal(size=(len(state.q), 3))
+    values = dict(state.values)
+    for name in TRIADS:
+        values[name] = values[name] * np.r_[np.full(3, 1.0 + relative), np.ones(3)]
+    return State(multiply(from_rotation_vector(turns), state.q), 0.0 * state.motion, values)
+
+
+def test_another_start_ends_at_the_same_place_and_the_noise_is_what_was_drawn() -> None:
+    """To a tenth of the sd, at which steps count for none; levels to what a few hundred residuals tell."""
+    flight, model, state = flown()
+    fits = [
+        fit_joint(model, off_from(model, state, turn_rad=turn, relative=relative), try_lever_arm=False)
+        for turn, relative in ((0.0, 0.0), (0.1, 0.05), (0.05, -0.1))
+    ]
+    one = fits[0]
+    for other in fits[1:]:
+        for name in TRIADS:
+            sd = np.sqrt(np.diagonal(one.covariance))[one.layout[name]]
+            assert np.abs((other.state.values[name] - one.state.values[name]) / sd).max() < 2.0 * SETTLED_SD, name
+    np.testing.assert_allclose(np.sqrt(one.levels.variance / flight.levels.variance), 1.0, atol=0.25)
+    assert np.sqrt(one.levels.walk / flight.levels.walk) == pytest.approx(1.0, abs=0.5)
+    assert one.levels.strength == pytest.approx(flight.levels.strength, rel=0.5)
+    true = np.concatenate([state.values[name] for name in TRIADS])
+    found = np.concatenate([one.state.values[name] for name in TRIADS])
+    sd = np.sqrt(np.diagonal(one.covariance))[:18]
+    assert np.abs((found - true) / sd).max() < 4.0
+    assert np.sqrt(np.mean(((found - true) / sd) ** 2)) < 1.6
+
+
+def test_no_minimum_within_the_iterations_is_told_with_their_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, model, state = flown(2.0)
+    monkeypatch.setattr(joint_fit, "MAX_ITERATIONS", 2)
+    with pytest.raises(EstimationError) as error:
+        fit_joint(model, off_from(model, state, turn_rad=0.1, relative=0.2), try_lever_arm=False)
+    assert error.value.measured["iterations"] == 2
+
+
+def test_a_fit_that_has_not_settled_by_then_starts_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, model, state = flown(2.0)
+    called: list[State] = []
+
+    def anew(given: Model, at: State) -> State:
+        called.append(at)
+        return State(state.q, 0.0 * state.motion, at.values)
+
+    monkeypatch.setattr(joint_fit.initialise, "anew", anew)
+    monkeypatch.setattr(joint_fit, "RESTART_AFTER_ITERATIONS", 3)
+    start = off_from(model, state, turn_rad=0.1, relative=0.1)
+    found = fit_joint(model, start, try_lever_arm=False)
+    assert len(called) == 1
+    assert called[0].values["gyroscope"] != pytest.approx(start.values["gyroscope"])
+    assert np.abs(found.state.values["magnetometer"] / state.values["magnetometer"] - 1.0)[:3].max() < 0.05
+    assert found.iterations > 3
+
+
+def test_iterations_of_a_fit_and_of_what_it_follows_are_added() -> None:
+    _, model, state = flown(2.0)
+    start = off_from(model, state, turn_rad=0.01, relative=0.01)
+    one, response = joint_fit._iterate(model, start, None, 0, Options(lever_arm=False))
+    other, _ = joint_fit._iterate(model, start, None, 100, Options(lever_arm=False))
+    assert other.iterations == one.iterations + 100
+    assert response.shape == (len(model.knots.index), 12, len(one.information))
+    again, _ = joint_fit._iterate(model, one.state, one.levels, 0, Options(lever_arm=False))
+    assert again.iterations < one.iterations
+    np.testing.assert_allclose(one.covariance @ one.information, np.eye(len(one.information)), atol=1e-6)
+
+
+def test_the_bias_walk_over_the_record_is_in_the_bias_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bias that is the mean over T and walks by q from it: q² T/3 at either end and between them."""
+    flight = small()
+    fit = made(flight)
+    k, p = len(flight.state.q), len(fit.covariance)
+    asked: list[Any] = []
+
+    def covariance(model: Any, chunks: Any, response: Any, information: Any, *others: Any) -> Array:
+        asked.append(others)
+        return fit.covariance.copy()
+
+    rates: list[Any] = []
+
+    def bias_walk(*given: Any) -> float:
+        rates.append(given)
+        return 0.3
+
+    monkeypatch.setattr(joint_fit, "covariance", covariance)
+    monkeypatch.setattr(joint_fit, "bias_walk", bias_walk)
+    response = np.random.default_rng(8).normal(size=(k, 12, p))
+    found = joint_fit._enlarged(fit, response)
+    added = np.zeros(p)
+    t = flight.model.readings.t
+    added[3:6] = 0.09 * (t[-1] - t[0]) / 3.0
+    np.testing.assert_allclose(found.covariance - fit.covariance, np.diag(added), atol=1e-9)
+    assert found.bias_walk == 0.3
+    knots, levels = flight.model.knots, flight.levels
+    whitening, jumps, process, poses = asked[0]
+    np.testing.assert_allclose(whitening, fit.weight / (levels.variance * levels.colour))
+    assert jumps[0] is fit.path.jump
+    np.testing.assert_allclose(jumps[1], knots.joined / np.sqrt(levels.walk * knots.interval_s))
+    np.testing.assert_allclose(process[0], whitened_motion(knots, levels.strength, response[:, 3:]))
+    np.testing.assert_allclose(process[1], whitened_motion(knots, levels.strength, flight.state.motion))
+    assert poses is None
+    rate, interval_s, joined = rates[0]
+    np.testing.assert_allclose(rate, body_jumps(flight.state, fit.path) / knots.interval_s[:, None])
+    assert interval_s is knots.interval_s
+    assert joined is knots.joined
