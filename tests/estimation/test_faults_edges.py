@@ -83,6 +83,41 @@ def test_all_that_it_stood_is_told_with_the_longest() -> None:
     assert f"stands at {value:.6g} mG for 3.0 s ({share:.1f} % of the recording" in fault.sentence
 
 
+@pytest.mark.parametrize(("jump", "stuck"), [(99, False), (100, True), (120, True), (140, True), (141, False)])
+def test_a_hold_is_a_stuck_channel_s_where_another_axis_moves_within_it(jump: int, stuck: bool) -> None:
+    """From the 100th sample to the 140th; a coarse sensor that lies still takes a step or two of its resolution."""
+    n = 300
+    x = np.sin(np.arange(n))
+    x[100:141] = x[100]
+    still = np.arange(n) % 2.0
+    still[jump] = 5.0
+    found = channel_faults(
+        "magnetometer", TICK_S * np.arange(n), np.stack([x, still, np.arange(n) % 3.0], axis=1), "mG", None
+    )
+    assert [f.code for f in found if f.axis == "x"] == (["stuck"] if stuck else [])
+
+
+@pytest.mark.parametrize(("steps", "stuck"), [(2.0, False), (3.0, True)])
+def test_two_steps_are_still(steps: float, stuck: bool) -> None:
+    n = 300
+    x = np.sin(np.arange(n))
+    x[100:141] = x[100]
+    beside = np.arange(n) % 2.0
+    beside[120] = steps
+    found = channel_faults(
+        "magnetometer", TICK_S * np.arange(n), np.stack([x, beside, np.arange(n) % 2.0], axis=1), "mG", None
+    )
+    assert [f.code for f in found if f.axis == "x"] == (["stuck"] if stuck else [])
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_logger_that_froze_stands_on_all_axes(axis: int) -> None:
+    x = np.stack([np.sin(np.arange(300.0) + i) for i in range(3)], axis=1)
+    x[100:141] = x[100]
+    found = channel_faults("magnetometer", TICK_S * np.arange(300), x, "mG", None)
+    assert [(f.code, f.axis) for f in found if f.axis == "xyz"[axis]] == [("stuck", "xyz"[axis])]
+
+
 def levels(*counts: int, seed: int = 1) -> np.ndarray:
     """So many samples of the levels 0, 1, 2 …, shuffled."""
     x = np.repeat(np.arange(float(len(counts))), counts)

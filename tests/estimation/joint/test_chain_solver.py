@@ -23,6 +23,7 @@ from fieldcal.estimation.joint.chain_solver import (
     Joints,
     Normal,
     Probe,
+    add_joints,
     chain_solve,
     joint_squares,
     place_knots,
@@ -121,6 +122,9 @@ def test_knots_cut_every_segment_into_equal_parts(spacing_s: float) -> None:
     for s, n in zip((0, 1), parts, strict=True):
         own = step[knots.joined & (segment[knots.index[1:]] == s)]
         assert np.abs(own - (1.0, 0.5)[s] / n).max() <= tick  # equal but for a sample
+    for s, n, begin, samples in ((0, parts[0], 0, 64), (1, parts[1], 65, 32)):
+        own = knots.index[segment[knots.index] == s]
+        assert own.tolist() == [begin + -(-samples * i // n) for i in range(n + 1)]  # the sample at an edge or after it
     assert knots.sample_s == tick
     for i, (knot, share) in enumerate(zip(knots.of_sample, knots.share, strict=True)):
         assert knots.index[knot] <= i
@@ -149,6 +153,9 @@ def test_the_translation_is_three_low_passes_that_peak_at_their_frequency() -> N
         whitener = motion.whitener[k]
         np.testing.assert_allclose(whitener @ noise @ whitener.T, np.eye(3), atol=1e-5)
         np.testing.assert_allclose(motion.whitened_transition[k], whitener @ transition, rtol=1e-6, atol=1e-6)
+    fast = place_knots(t * 0.02, np.zeros(17, dtype=np.int64), 0.0001).motion
+    transition = expm(rate * 1e-3)  # what is faster is taken for a millisecond
+    np.testing.assert_allclose(fast.whitened_transition[0], fast.whitener[0] @ transition, rtol=1e-6, atol=1e-6)
     start = motion.start_whitener
     np.testing.assert_allclose(start @ stationary @ start.T, np.eye(3), atol=1e-9)
 
@@ -382,3 +389,24 @@ def test_probes_are_signs_and_bridges_between_the_knots() -> None:
     other = Probe.draw(knots, t, at, 6, seed=1)
     assert (other.jump != probe.jump).any()
     assert (Probe.draw(knots, t, at, 6, seed=0).jump == probe.jump).all()
+
+
+def test_a_bridge_is_none_where_all_the_time_of_an_interval_has_passed_or_none() -> None:
+    """In every interval the sixth step is long and the others take no time: before it and after it the walk stands
+    where a knot does. In the last interval too."""
+    step = np.tile(np.where(np.arange(10) == 5, 1.0, 1e-9), 30)
+    t = np.concatenate([[0.0], np.cumsum(step)])
+    every = place_knots(np.arange(301.0), np.zeros(301, dtype=np.int64), 10.0)
+    share = (t - t[every.index[every.of_sample]]) / np.r_[np.full(30, 1.0 + 9e-9), 1.0][every.of_sample]
+    probe = Probe.draw(replace(every, share=share), t, np.arange(301), 3)
+    assert np.abs(probe.bridge).max() < 1e-3
+
+
+def test_an_attitude_that_nothing_tells_is_known_to_ten_radians() -> None:
+    flight = small()
+    knots = flight.model.knots
+    k = len(knots.index)
+    normal, probe = Normal.empty(k, 2, 5), Probe.draw(knots, flight.model.readings.t, flight.model.at, 6)
+    joints = Joints(np.zeros((k - 1, 3)), np.zeros((k - 1, 3, 2)), 1e12, np.zeros((k, 9)), 1e12)
+    add_joints(normal, knots, joints, probe)
+    np.testing.assert_allclose(normal.diagonal[:, :3, :3], np.tile(np.eye(3) / 10.0**2, (k, 1, 1)), atol=1e-8)
