@@ -66,6 +66,7 @@ _TURNED = "which attitudes are also solved in frames that are turned by half; th
 _START = "where the iteration starts; another start ends at the same minimum"
 _STEP = "the step of a central difference, far from where rounding or curvature count"
 _SHORT = "no record is that short: it has some rows a second, over seconds"
+_UNREAD = "a place more that is not read"
 _DIGITS = "a scale near that of the readings, for the digits alone"
 _SIGNS = "signs are 1 or -1, and a sum of three of them is odd"
 _DOWN = "another way down to the same minimum"
@@ -1581,5 +1582,132 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "return cls(sensors, jump, motion, start, bridge * np.r_[knots.joined, False][knot, None])",
         "False → True",
     ): "no time has passed at the last knot",
+    (
+        "estimation.joint.measurement_model",
+        "",
+        "CHUNK_ROWS = 512  # at a time: a few megabytes with all intermediate arrays, what a core holds in its cache",
+        "512 → 563",
+    ): _AT_A_TIME,
+    (
+        "estimation.joint.measurement_model",
+        "trajectory",
+        "spread = knots.share[:, None] * np.r_[jump, np.zeros((1, 3))][knots.of_sample]",
+        "1 → 2",
+    ): _UNREAD,
+    (
+        "estimation.joint.measurement_model",
+        "_since_knots",
+        "total = np.empty((len(step) + 1, len(count) + 1, 4))",
+        "1 → 2",
+    ): _UNREAD,
+    (
+        "estimation.joint.measurement_model",
+        "residuals",
+        "out[span, 3 * i : 3 * i + 3] = _residual(model, state, span, name, sensed)",
+        "3 → 4 #2",
+    ): "rows end with the second triad",
+    (
+        "estimation.joint.measurement_model",
+        "_slow_rate",
+        "first, last = max(int(at[0]) - side, 0), int(at[-1]) + side + 1",
+        "1 → 2",
+    ): _UNREAD,
+    (
+        "estimation.joint.measurement_model",
+        "sensitivities",
+        "row = slice(3 * i, 3 * i + 3)",
+        "3 → 4 #2",
+    ): "rows end with the second triad",
+    (
+        "estimation.joint.measurement_model",
+        "_turned_by_gyroscope",
+        "ends[..., ~np.r_[knots.joined, False][knot_span]] = 0.0",
+        "False → True",
+    ): "no time passes behind the last knot",
+    (
+        "estimation.joint.measurement_model",
+        "accumulate",
+        "columns = np.empty((m + 1, r, 6 + 6 + p + 1 + 3 + 2))",
+        "1 → 2",
+    ): _UNREAD,
+    (
+        "estimation.joint.measurement_model",
+        "accumulate",
+        "by_signs = (others[..., :p].transpose(1, 2, 0) @ probes_of_row[..., :1].transpose(1, 0, 2))[..., 0].T",
+        "1 → 2 #2",
+    ): "the first of them is taken",
+    (
+        "estimation.joint.measurement_model",
+        "accumulate",
+        "for knot, part, here in ((knot_span, slice(0, 6), slice(None)), (following, slice(6, 12), inside)):",
+        "12 → 13",
+    ): "there are twelve",
+    (
+        "estimation.joint.measurement_model",
+        "_padded",
+        "step = np.arange(max(int(counts.max()), 1))",
+        "1 → 2",
+    ): "intervals are filled up with rows of zeros",
+    (
+        "estimation.joint.pose_measurement",
+        "VpsRecord._outliers",
+        "suspect = whole & (length > limit)",
+        "> → >=",
+    ): _NEVER_MET,
+    (
+        "estimation.joint.pose_measurement",
+        "VpsRecord._outliers",
+        "bad[1:-1] = suspect & (score[1:-1] >= score[:-2]) & (score[1:-1] >= score[2:])",
+        ">= → > #2",
+    ): _NEVER_MET,
+    (
+        "estimation.joint.pose_measurement",
+        "VpsRecord._outliers",
+        "bad[1:-1] = suspect & (score[1:-1] >= score[:-2]) & (score[1:-1] >= score[2:])",
+        ">= → >",
+    ): _NEVER_MET,
+    (
+        "estimation.joint.pose_measurement",
+        "VpsRecord._read",
+        "available = (at >= self.t[0]) & (at <= self.t[-1]) & (self.t[i + 1] - self.t[i] <= self.max_gap_s)",
+        "<= → < #2",
+    ): _NEVER_MET,
+    (
+        "estimation.joint.pose_measurement",
+        "VpsRecord._read",
+        "available = (at >= self.t[0]) & (at <= self.t[-1]) & (self.t[i + 1] - self.t[i] <= self.max_gap_s)",
+        ">= → >",
+    ): _NEVER_MET,
+    (
+        "estimation.joint.pose_measurement",
+        "VpsRecord._read",
+        "available = (at >= self.t[0]) & (at <= self.t[-1]) & (self.t[i + 1] - self.t[i] <= self.max_gap_s)",
+        "<= → <",
+    ): _NEVER_MET,
+    (
+        "estimation.joint.pose_measurement",
+        "VpsRecord.add",
+        "normal.right[:, :3, p + GRADIENT] += residual * weight[:, None]",
+        "+ → - #2",
+    ): "the gradient is the first right-hand side",
+    ("estimation.joint.pose_measurement", "VpsRecord.add", "flat = g.reshape(-1, p)", "1 → 2"): _ANY_NEGATIVE,
+    (
+        "estimation.joint.pose_measurement",
+        "VpsRecord.add",
+        "normal.parameters += flat.T @ weighted.reshape(-1, p)",
+        "1 → 2",
+    ): _ANY_NEGATIVE,
+    (
+        "estimation.joint.pose_measurement",
+        "VpsRecord.add",
+        "normal.parameters_right[:, GRADIENT] += weighted.reshape(-1, p).T @ residual.reshape(-1)",
+        "1 → 2 #2",
+    ): _ANY_NEGATIVE,
+    (
+        "estimation.joint.pose_measurement",
+        "VpsRecord.add",
+        "normal.parameters_right[:, GRADIENT] += weighted.reshape(-1, p).T @ residual.reshape(-1)",
+        "1 → 2",
+    ): _ANY_NEGATIVE,
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

@@ -228,3 +228,17 @@ def test_an_arm_is_asked_of_the_accelerometer_alone() -> None:
     geometry = lever_arm_geometry(flight.model, flight.state, slice(None))
     change = -(geometry @ ARM) / scale * flight.model.triads["accelerometer"].valid[:, None]
     np.testing.assert_allclose((without - with_arm)[:, :3], change, atol=1e-12)
+
+
+@pytest.mark.parametrize("most", [40, 17, 5])
+def test_a_chunk_ends_with_the_interval_that_fills_it(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measurement_model, "CHUNK_ROWS", most)
+    model = small().model
+    spans = list(measurement_model.chunks(model))
+    for rows, knots in spans:
+        own = model.knots.index[knots.stop - 1] - rows.start  # without its last interval
+        assert own < most or rows.stop == len(model.at)
+    assert len(spans) > len(model.at) // (most + 18) - 1
+    assert [rows.start for rows, _ in spans] == [0, *[rows.stop for rows, _ in spans[:-1]]]
+    assert spans[-1][0].stop == len(model.at)
+    assert spans[-1][1].stop == len(model.knots.index)
