@@ -67,6 +67,8 @@ _START = "where the iteration starts; another start ends at the same minimum"
 _STEP = "the step of a central difference, far from where rounding or curvature count"
 _SHORT = "no record is that short: it has some rows a second, over seconds"
 _UNREAD = "a place more that is not read"
+_SETTLED = "what has settled moves by a small part of its standard deviation in any further step"
+_FIRST = "the gyroscope is the first of the parameters"
 _DIGITS = "a scale near that of the readings, for the digits alone"
 _SIGNS = "signs are 1 or -1, and a sum of three of them is odd"
 _DOWN = "another way down to the same minimum"
@@ -1709,5 +1711,79 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "normal.parameters_right[:, GRADIENT] += weighted.reshape(-1, p).T @ residual.reshape(-1)",
         "1 → 2",
     ): _ANY_NEGATIVE,
+    ("estimation.joint.fit", "", "MAX_ITERATIONS = 50", "50 → 55"): _CONVERGED,
+    ("estimation.joint.fit", "", "LARGEST_REVERSED_STEP_SHARE = 0.5", "0.5 → 0.55"): _DOWN,
+    (
+        "estimation.joint.fit",
+        "",
+        "RESTART_AFTER_ITERATIONS = 20  # a fit that has not converged by then starts anew from the constants it has reached",
+        "20 → 22",
+    ): _DOWN,
+    ("estimation.joint.fit", "", "CONVERGED_STEP_SD = 0.1", "0.1 → 0.11000000000000001"): _SETTLED,
+    (
+        "estimation.joint.fit",
+        "",
+        "SMALLEST_STEP = 1e-8  # of centred parameters, which are of order one: rounding; also converged",
+        "1e-08 → 1.1000000000000001e-08",
+    ): _CONVERGED,
+    (
+        "estimation.joint.fit",
+        "JointFit.full_constants",
+        'jacobian[9:] -= np.einsum("ijp,j->ip", jacobian[:9].reshape(3, 3, -1), triad.centre)',
+        "1 → 2",
+    ): _ANY_NEGATIVE,
+    (
+        "estimation.joint.fit",
+        "_is_slow",
+        "return bool(np.any(slow > CHANCE_COLOUR_RATIO * fit.levels.colour))",
+        "> → >=",
+    ): _NEVER_MET,
+    ("estimation.joint.fit", "_enlarged", 'bias = np.arange(3, 6) + fit.layout["gyroscope"].start', "+ → -"): _FIRST,
+    ("estimation.joint.fit", "_iterate", 'scales = layout["gyroscope"].start + np.arange(3)', "+ → -"): _FIRST,
+    (
+        "estimation.joint.fit",
+        "_iterate",
+        "if change @ information @ previous < -LARGEST_REVERSED_STEP_SHARE * (previous @ information @ previous):",
+        "< → <=",
+    ): _NEVER_MET,
+    (
+        "estimation.joint.fit",
+        "_iterate",
+        "if change @ information @ previous < -LARGEST_REVERSED_STEP_SHARE * (previous @ information @ previous):",
+        "* → /",
+    ): _DOWN,
+    (
+        "estimation.joint.fit",
+        "_iterate",
+        "if change @ information @ previous < -LARGEST_REVERSED_STEP_SHARE * (previous @ information @ previous):",
+        "without -",
+    ): _DOWN,
+    ("estimation.joint.fit", "_iterate", "share *= LARGEST_REVERSED_STEP_SHARE", "* → /"): _DOWN,
+    ("estimation.joint.fit", "_iterate", "previous = share * change", "* → /"): _DOWN,
+    ("estimation.joint.fit", "_iterate", "sd = 1.0 / np.sqrt(np.diagonal(information))", "1.0 → 1.1"): _SETTLED,
+    (
+        "estimation.joint.fit",
+        "_iterate",
+        "converged = max(level_change, float(np.max(np.abs(change) / sd))) < CONVERGED_STEP_SD",
+        "< → <=",
+    ): _NEVER_MET,
+    (
+        "estimation.joint.fit",
+        "_iterate",
+        "if converged or float(np.max(np.abs(change))) < SMALLEST_STEP:",
+        "< → <=",
+    ): _NEVER_MET,
+    (
+        "estimation.joint.fit",
+        "_iterate",
+        "if converged or float(np.max(np.abs(change))) < SMALLEST_STEP:",
+        "max → min",
+    ): _SETTLED,
+    (
+        "estimation.joint.fit",
+        "_no_minimum",
+        "for axis in np.flatnonzero(white_noise_sigma(triad.x[triad.valid]) > LARGEST_NOISE_SHARE)",
+        "> → >=",
+    ): _NEVER_MET,
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""
