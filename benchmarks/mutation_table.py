@@ -69,6 +69,7 @@ _SHORT = "no record is that short: it has some rows a second, over seconds"
 _UNREAD = "a place more that is not read"
 _SETTLED = "what has settled moves by a small part of its standard deviation in any further step"
 _FIRST = "the gyroscope is the first of the parameters"
+_TURNS = "the turn between two vectors does not depend on their lengths"
 _DIGITS = "a scale near that of the readings, for the digits alone"
 _SIGNS = "signs are 1 or -1, and a sum of three of them is odd"
 _DOWN = "another way down to the same minimum"
@@ -1784,6 +1785,207 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "_no_minimum",
         "for axis in np.flatnonzero(white_noise_sigma(triad.x[triad.valid]) > LARGEST_NOISE_SHARE)",
         "> → >=",
+    ): _NEVER_MET,
+    ("estimation.joint.initialise", "", "START_CUTOFF_HZ = 4.0", "4.0 → 4.4"): _START,
+    (
+        "estimation.joint.initialise",
+        "",
+        "WINDOWS = ((0.2, 1.5), (0.07, 4.5), (0.02, 15.0))",
+        "0.2 → 0.22000000000000003",
+    ): _START,
+    (
+        "estimation.joint.initialise",
+        "",
+        "WINDOWS = ((0.2, 1.5), (0.07, 4.5), (0.02, 15.0))",
+        "1.5 → 1.6500000000000001",
+    ): _START,
+    (
+        "estimation.joint.initialise",
+        "",
+        "WINDOWS = ((0.2, 1.5), (0.07, 4.5), (0.02, 15.0))",
+        "0.07 → 0.07700000000000001",
+    ): _START,
+    ("estimation.joint.initialise", "", "WINDOWS = ((0.2, 1.5), (0.07, 4.5), (0.02, 15.0))", "4.5 → 4.95"): _START,
+    (
+        "estimation.joint.initialise",
+        "",
+        "WINDOWS = ((0.2, 1.5), (0.07, 4.5), (0.02, 15.0))",
+        "0.02 → 0.022000000000000002",
+    ): _START,
+    ("estimation.joint.initialise", "", "WINDOWS = ((0.2, 1.5), (0.07, 4.5), (0.02, 15.0))", "15.0 → 16.5"): _START,
+    (
+        "estimation.joint.initialise",
+        "_fastest_turning_hz",
+        "from_hz = min(NOISE_HZ[0], 0.5 * frequency[-1])",
+        "1 → 2",
+    ): "half a bin of the spectrum",
+    (
+        "estimation.joint.initialise",
+        "_fastest_turning_hz",
+        "over = np.mean(density / np.maximum(noise, 1e-300), axis=1)",
+        "1e-300 → 1.1000000000000002e-300",
+    ): _GUARD,
+    (
+        "estimation.joint.initialise",
+        "_fastest_turning_hz",
+        "return float(np.clip(frequency[max(lost[0] - 1, 0)] if len(lost) else np.inf, *TURNING_HZ))",
+        "0 → 1 #2",
+    ): "what lies below half a hertz counts as that",
+    (
+        "estimation.joint.initialise",
+        "_start_attitude",
+        "both = {name: low_passed(r.t, r.segment, x, START_CUTOFF_HZ, 0.5) for name, x in sensed.items()}",
+        "0.5 → 0.55",
+    ): _START,
+    (
+        "estimation.joint.initialise",
+        "_means",
+        "trust = 1.0 / (1.0 + np.sum(((field - mean) / limit) ** 2, axis=1, keepdims=True))",
+        "1.0 → 1.1",
+    ): "a factor of all weights",
+    (
+        "estimation.joint.initialise",
+        "_means",
+        'out["magnetometer"] = weighted[:, :3] / np.maximum(weighted[:, 3:], 1e-3)',
+        "0.001 → 0.0011",
+    ): _GUARD,
+    (
+        "estimation.joint.initialise",
+        "_turned_to",
+        "return wahba.attitudes(both, reference, np.array([0.02, 0.02])).q",
+        "0.02 → 0.022000000000000002",
+    ): _START,
+    (
+        "estimation.joint.initialise",
+        "_turned_to",
+        "return wahba.attitudes(both, reference, np.array([0.02, 0.02])).q",
+        "0.02 → 0.022000000000000002 #2",
+    ): _START,
+    (
+        "estimation.joint.initialise",
+        "_turned_to",
+        "seen = vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)",
+        "/ → *",
+    ): _TURNS,
+    (
+        "estimation.joint.initialise",
+        "_turned_to",
+        "seen = vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)",
+        "1e-300 → 1.1000000000000002e-300",
+    ): _GUARD,
+    (
+        "estimation.joint.initialise",
+        "_turned_to",
+        'true = r.field_ned / np.linalg.norm(r.field_ned) if name == "magnetometer" else down',
+        "/ → *",
+    ): _TURNS,
+    (
+        "estimation.joint.initialise",
+        "_turned_to",
+        "return from_rotation_vector(axis * (angle / np.maximum(sine, 1e-12))[:, None])",
+        "1e-12 → 1.1000000000000002e-12",
+    ): _GUARD,
+    (
+        "estimation.joint.initialise",
+        "gyro_from_attitude",
+        "logged = low_passed(t, segment, gyroscope, START_CUTOFF_HZ, 0.5)",
+        "0.5 → 0.55",
+    ): _START,
+    (
+        "estimation.joint.initialise",
+        "gyro_from_attitude",
+        "q_dot[a:b] = differentiate_samples(t[a:b], q[a:b], window_s=0.05)",
+        "0.05 → 0.05500000000000001",
+    ): _START,
+    (
+        "estimation.joint.model_selection",
+        "",
+        "PREDICT_ITERATIONS, PREDICT_STEP_RAD = 10, 1e-6  # most iterations, and the step at which they end",
+        "10 → 11",
+    ): _CONVERGED,
+    (
+        "estimation.joint.model_selection",
+        "",
+        "PREDICT_ITERATIONS, PREDICT_STEP_RAD = 10, 1e-6  # most iterations, and the step at which they end",
+        "1e-06 → 1.1e-06",
+    ): _CONVERGED,
+    (
+        "estimation.joint.model_selection",
+        "candidates",
+        "if force is not None and float(np.sqrt(np.mean(np.sum(force**2, axis=1)))) > LEAST_FORCE_MPS2:",
+        "> → >=",
+    ): _NEVER_MET,
+    (
+        "estimation.joint.model_selection",
+        "candidates",
+        "if float(np.sqrt(np.mean(np.sum(fit.path.rate**2, axis=1)))) > LEAST_RATE_RADPS:",
+        "> → >=",
+    ): _NEVER_MET,
+    (
+        "estimation.joint.model_selection",
+        "_scores",
+        "scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))",
+        "/ → *",
+    ): _DIGITS,
+    (
+        "estimation.joint.model_selection",
+        "_scores",
+        "scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))",
+        "1.0 → 1.1",
+    ): _DIGITS,
+    (
+        "estimation.joint.model_selection",
+        "_scores",
+        "scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))",
+        "1e-300 → 1.1000000000000002e-300",
+    ): _GUARD,
+    (
+        "estimation.joint.model_selection",
+        "_scores",
+        "@ np.linalg.lstsq(unit[np.ix_(rest, rest)], unit[np.ix_(rest, tested)], rcond=1e-10)[0]",
+        "1e-10 → 1.1000000000000001e-10",
+    ): _RCOND,
+    (
+        "estimation.joint.model_selection",
+        "_scores",
+        "covariance = np.linalg.pinv(left, rcond=1e-6, hermitian=True)",
+        "1e-06 → 1.1e-06",
+    ): _RCOND,
+    (
+        "estimation.joint.model_selection",
+        "_scores",
+        "covariance = np.linalg.pinv(left, rcond=1e-6, hermitian=True)",
+        "True → False",
+    ): _ALGORITHM,
+    (
+        "estimation.joint.model_selection",
+        "_scores",
+        "out[name] = float(step[these] @ np.linalg.lstsq(covariance[these, these], step[these], rcond=1e-10)[0])",
+        "1e-10 → 1.1000000000000001e-10",
+    ): _RCOND,
+    (
+        "estimation.joint.model_selection",
+        "_scores",
+        "follow = np.linalg.lstsq(unit[np.ix_(rest, rest)], unit[np.ix_(rest, own)], rcond=1e-10)[0]",
+        "1e-10 → 1.1000000000000001e-10",
+    ): _RCOND,
+    (
+        "estimation.joint.model_selection",
+        "_scores",
+        "alone = np.linalg.pinv(left[these, these], rcond=1e-6, hermitian=True) @ (gradient[own, GRADIENT] * scale[own])",
+        "1e-06 → 1.1e-06",
+    ): _RCOND,
+    (
+        "estimation.joint.model_selection",
+        "_scores",
+        "alone = np.linalg.pinv(left[these, these], rcond=1e-6, hermitian=True) @ (gradient[own, GRADIENT] * scale[own])",
+        "True → False",
+    ): _ALGORITHM,
+    (
+        "estimation.joint.model_selection",
+        "_predicted",
+        "if np.max(np.abs(step[:, :3])) < PREDICT_STEP_RAD:",
+        "< → <=",
     ): _NEVER_MET,
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

@@ -30,6 +30,7 @@ BIAS = {
 }
 INTEGRATED_RAD = 5e-4
 RESOLUTION_HZ = 1.0 / 8.0  # of a spectrum over 8 s
+RIPPLE = 1e-4  # of a low-pass of 0.2 Hz at a quarter of the sampling rate
 
 
 def test_stretches_are_low_passed_apart() -> None:
@@ -70,6 +71,63 @@ def test_turning_ends_where_its_density_falls_below_ten_times_the_noise(
     assert fastest(t, x) == pytest.approx(expected, abs=2.5 * RESOLUTION_HZ)
 
 
+def by_spectrum(monkeypatch: pytest.MonkeyPatch, density: Array, top_hz: float = 64.0) -> float:
+    """The frequency that is read off a spectrum (bins of RESOLUTION_HZ up to `top_hz`), alike on three axes."""
+    asked = []
+
+    def welch(x: Array, rate_hz: float, *, nperseg: int, axis: int) -> tuple[Array, Array]:
+        asked.append((x.shape, rate_hz, nperseg, axis))
+        return RESOLUTION_HZ * np.arange(len(density)), np.tile(density[:, None], 3)
+
+    monkeypatch.setattr(initialise, "welch", welch)
+    assert len(density) == round(top_hz / RESOLUTION_HZ) + 1
+    for seconds, length in ((60.0, 1024), (4.0, 512)):
+        t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+        found = fastest(t, np.zeros((len(t), 3)))
+        assert asked.pop() == ((len(t), 3), pytest.approx(RATE_HZ), length, 0)
+    return found
+
+
+def bins(*spans: tuple[float, float, float], top_hz: float = 64.0, floor: float = 1.0) -> Array:
+    """A density of `floor` but for (from Hz, to Hz, density), both ends included."""
+    f = RESOLUTION_HZ * np.arange(round(top_hz / RESOLUTION_HZ) + 1)
+    out = np.full(len(f), floor)
+    for begin, end, value in spans:
+        out[(f >= begin) & (f <= end)] = value
+    return out
+
+
+def test_the_end_of_turning_is_read_off_its_spectrum(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the strongest bin up to 5 Hz on, to the last before one below ten times the noise."""
+    assert by_spectrum(monkeypatch, bins((0.0, 3.0, 10.5), (1.0, 1.0, 50.0))) == 3.0
+    assert by_spectrum(monkeypatch, bins((0.0, 3.0, 10.0), (1.0, 1.0, 50.0))) == 3.0
+    assert by_spectrum(monkeypatch, bins((0.0, 3.0, 9.9), (1.0, 1.25, 50.0))) == 1.25
+    assert by_spectrum(monkeypatch, bins((0.0, 3.0, 20.0), (2.0, 2.0, 9.0), (2.5, 2.5, 50.0))) == 3.0
+    assert by_spectrum(monkeypatch, bins((0.0, 4.0, 20.0), (2.0, 2.0, 9.0), (1.0, 1.0, 50.0))) == 1.875
+    assert by_spectrum(monkeypatch, bins((2.0, 2.0, 100.0), (4.0, 5.0, 50.0), (5.0, 5.0, 500.0))) == 5.0
+    assert by_spectrum(monkeypatch, bins((4.25, 4.5, 100.0), (1.0, 1.0, 50.0), (6.0, 6.0, 1e3))) == 4.5
+    assert by_spectrum(monkeypatch, bins((0.0, 0.25, 100.0))) == 0.5
+
+
+def test_noise_is_the_median_from_five_hertz_to_twenty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 121 bins 61 have a density of 1 and 60 one of 5, so that one bin more or less on either end decides whether
+    turning of a density of 20 is above ten times the noise."""
+    quiet = bins((5.0, 5.0 + 29 * RESOLUTION_HZ, 1.0), (20.0 - 30 * RESOLUTION_HZ, 20.0, 1.0), floor=5.0)
+    assert (quiet == 1.0).sum() == 61
+    quiet[: round(2.0 / RESOLUTION_HZ) + 1] = 20.0
+    quiet[8] = 21.0
+    assert by_spectrum(monkeypatch, quiet) == 2.0
+
+
+def test_noise_of_slow_samples_is_the_median_of_the_upper_half(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Up to 4 Hz: of the 17 bins from 2 Hz on 9 have a density of 1."""
+    quiet = bins((2.0, 2.5, 1.0), (3.5, 3.875, 1.0), top_hz=4.0, floor=5.0)
+    assert (quiet == 1.0).sum() == 9
+    quiet[: round(1.0 / RESOLUTION_HZ) + 1] = 20.0
+    quiet[4] = 21.0
+    assert by_spectrum(monkeypatch, quiet, top_hz=4.0) == 1.0
+
+
 def test_turning_is_cut_off_between_half_a_hertz_and_five() -> None:
     t = np.arange(round(60 * RATE_HZ)) / RATE_HZ
     noise = np.random.default_rng(5).normal(size=(len(t), 3))
@@ -81,7 +139,7 @@ def test_turning_is_cut_off_between_half_a_hertz_and_five() -> None:
 
 def test_the_longest_stretch_tells() -> None:
     t = np.arange(round(90 * RATE_HZ)) / RATE_HZ
-    segment = (t >= 30.0).astype(np.int64)
+    segment = (t < 60.0).astype(np.int64)
     noise = np.random.default_rng(6).normal(size=(len(t), 3))
     x = noise + np.where(segment[:, None] == 1, band(t, 3.0, 1e3), band(t, 1.0, 1e3))
     assert fastest(t, x, segment) == pytest.approx(3.0, abs=2.5 * RESOLUTION_HZ)
@@ -205,6 +263,7 @@ def test_a_record_is_prepared_at_its_truth(sign: float, parts: int) -> None:
     r, q = flown(sign=sign, parts=parts)
     model, state = prepare(r, CONSTANTS, lever_arm=np.array([0.1, 0.2, 0.3]))
     assert angle(state.q, q[model.knots.index]).max() < 20.0 * INTEGRATED_RAD
+    assert state.motion.shape == (len(model.knots.index), 9)
     assert not state.motion.any()
     assert state.values["lever_arm"].tolist() == [0.1, 0.2, 0.3]
     assert state.values["dip"] == pytest.approx(np.arctan2(FIELD_NED[2], np.hypot(*FIELD_NED[:2])))
@@ -239,20 +298,25 @@ def test_a_triad_without_a_start_is_left_out() -> None:
     assert model.vectors == ("accelerometer",)
     assert "magnetometer" not in state.values
     assert model.readings.magnetometer is None
+    model, state = prepare(replace(r, magnetometer=None), CONSTANTS)
+    assert (model.vectors, "magnetometer" in state.values) == (("accelerometer",), False)
 
 
 def test_vectors_are_averaged_by_the_rms_rate_times_three() -> None:
     """At 128 Hz three samples are 23 ms: never; at 512 Hz while 3 · rms rate · time is below 0.1 rad."""
     t = np.arange(10240) / 512.0
-    for rms_radps, side in ((0.5, 4), (3.0, 2), (8.0, 0)):
+    bias = np.array([2.0, -2.0, 2.0])
+    for rms_radps, side in ((0.5, 4), (3.0, 2), (3.37, 2), (3.6, 1), (8.0, 0)):  # 5.06 samples at 3.37 rad/s
         rate = np.tile(rms_radps * np.array([0.6, 0.0, 0.8]), (len(t), 1))
         q = propagate(t, rate, np.array([0.0, 0.0, 0.0, 1.0]))
         turn = body_from_inertial(q)
         sensed = {"gyroscope": rate, "accelerometer": G * turn[..., 2], "magnetometer": turn @ FIELD_NED}
         rng = np.random.default_rng(12)
-        logged = {n: (x + 1e-6 * rng.normal(size=x.shape) - BIAS[n]) / SCALE[n] for n, x in sensed.items()}
+        constants = {**CONSTANTS, "gyroscope": (SCALE["gyroscope"], bias)}
+        noisy = {n: x + 1e-6 * rng.normal(size=x.shape) for n, x in sensed.items()}
+        logged = {n: (x - constants[n][1]) / SCALE[n] for n, x in noisy.items()}
         low = np.stack([logged["gyroscope"], np.zeros_like(rate)])
-        model, _ = prepare(blank(t, np.zeros(len(t), dtype=np.int64), **logged, turning=low), CONSTANTS)
+        model, _ = prepare(blank(t, np.zeros(len(t), dtype=np.int64), **logged, turning=low), constants)
         assert int(np.diff(model.at)[0]) == 2 * side + 1
 
 
