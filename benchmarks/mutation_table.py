@@ -70,6 +70,7 @@ _UNREAD = "a place more that is not read"
 _SETTLED = "what has settled moves by a small part of its standard deviation in any further step"
 _FIRST = "the gyroscope is the first of the parameters"
 _TURNS = "the turn between two vectors does not depend on their lengths"
+_HELD = "parameters are held: which of them have columns does not matter"
 _DIGITS = "a scale near that of the readings, for the digits alone"
 _SIGNS = "signs are 1 or -1, and a sum of three of them is odd"
 _DOWN = "another way down to the same minimum"
@@ -1987,5 +1988,53 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "if np.max(np.abs(step[:, :3])) < PREDICT_STEP_RAD:",
         "< → <=",
     ): _NEVER_MET,
+    (
+        "estimation.joint.model_selection",
+        "_scores",
+        "scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))",
+        "maximum → minimum",
+    ): _DIGITS,
+    (
+        "estimation.joint.model_selection",
+        "_predicted",
+        "free = {name: v for name, v in state.values.items() if name in TERMS or name in PARAMETERS}",
+        "or → and",
+    ): _HELD,
+    (
+        "estimation.joint.model_selection",
+        "_predicted",
+        "free = {name: v for name, v in state.values.items() if name in TERMS or name in PARAMETERS}",
+        "in → not in",
+    ): _HELD,
+    (
+        "estimation.joint.model_selection",
+        "_predicted",
+        "layout, p = layout_of(model, free, dip=False, lever_arm=False)",
+        "False → True",
+    ): _HELD,
+    (
+        "estimation.joint.model_selection",
+        "_predicted",
+        "layout, p = layout_of(model, free, dip=False, lever_arm=False)",
+        "False → True #2",
+    ): _HELD,
+    (
+        "estimation.joint.model_selection",
+        "_predicted",
+        "step = normal.eliminate()[0][:, :, p + GRADIENT]",
+        "+ → -",
+    ): "the gradient is the first right-hand side",
+    (
+        "estimation.joint.model_selection",
+        "_predicted",
+        "if np.max(np.abs(step[:, :3])) < PREDICT_STEP_RAD:",
+        "3 → 4",
+    ): _CONVERGED,
+    (
+        "estimation.joint.model_selection",
+        "_gain",
+        "blocks = max(1, round(float(knots.interval_s.sum()) / BLOCK_S))",
+        "1 → 2",
+    ): "fewer than six are not looked at",
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

@@ -13,6 +13,7 @@ from small_record import VALUES, Small, mixed, small
 from test_chain_solver import assembled
 from test_fit_parts import made
 from test_score_corrections import Flight, stamps
+from test_vps_record import aligned, flight, with_vps
 
 from fieldcal.errors import EstimationError
 from fieldcal.estimation.joint import model_selection
@@ -24,6 +25,7 @@ from fieldcal.estimation.joint.problem import TERMS
 from fieldcal.geometry.rotation import Array, from_rotation_vector, multiply
 
 NEAR = 1e-3
+SETTLED = 1e-5  # of residuals over their sd, where iterations end
 
 
 def record(*, warmth: Array | None = None, force: Array | None = None, rate: float = 1.0, **how: Any) -> JointFit:
@@ -218,6 +220,7 @@ def test_terms_that_cannot_be_fitted_are_doubted(monkeypatch: pytest.MonkeyPatch
     fit, tests = add_terms(script.fit)
     assert fit is script.fit
     assert not any(test.kept for test in tests)
+    assert script.made == [["magnetometer_cross"]]  # of the others nothing was found out
     assert script.doubted == [2.0, 3.0, 0.0]
 
 
@@ -293,6 +296,8 @@ def test_a_gain_is_the_drop_over_its_sd_by_blocks() -> None:
     expected = drop.sum() / np.sqrt(np.sum((drop - changed) ** 2))
     assert model_selection._gain(model, a, b) == pytest.approx(expected)
     assert model_selection._gain(model, a, a) == 0.0
+    small_a, small_b = (replace(x, rows=1e-3 * x.rows, links=1e-3 * x.links) for x in (a, b))
+    assert model_selection._gain(model, small_a, small_b) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("blocks", "told"), [(6, True), (5, False)])
@@ -323,10 +328,10 @@ def test_parts_of_the_record_begin_where_the_fit_is() -> None:
         assert angle(state.q, fit.path.q[at]).max() < 1e-12
         assert (state.motion == fit.state.motion[fit.model.knots.of_sample[at]]).all()
         assert state.values is fit.state.values
-        # As far apart as the fit's.
-        longest = model.knots.interval_s[model.knots.joined].max()
-        assert longest <= fit.model.knots.interval_s[fit.model.knots.joined].max() * 1.01 + 0.007
-        assert longest > 0.5 * fit.model.knots.interval_s[fit.model.knots.joined].max()
+    # As far apart as the fit's: cut at its knots, a part has its knots.
+    index = fit.model.knots.index
+    model, _, _ = model_selection._part(fit, 0, int(index[5]) + 1)
+    assert model.knots.index.tolist() == index[:6].tolist()
 
 
 class Split:
@@ -347,15 +352,17 @@ class Split:
 
     def part(self, fit: JointFit, a: int, b: int) -> Any:
         self.parts.append((a, b))
-        return SimpleNamespace(), SimpleNamespace(names=()), None
+        return f"from {a}", SimpleNamespace(names=()), None
 
     def refitted(self, model: Any, state: Any, levels: Any, like: Any, names: list[str], vps: Any) -> Any:
+        assert model == "from 0"
         if self.fails in names and self.fails:
             raise EstimationError("joint_diverged", "no")  # type: ignore[arg-type]
         all_names = (*state.names, *names)
         return SimpleNamespace(state=SimpleNamespace(names=all_names), levels=None, names=all_names)
 
     def gain(self, model: Any, without: Any, term: Any) -> float:
+        assert model == f"from {self.parts[1][0]}"
         self.compared.append((without, term))
         return self.gains[term[0]]
 
@@ -393,13 +400,45 @@ def test_a_prediction_finds_the_attitudes_and_the_translation_of_known_constants
     steady = replace(fit, levels=replace(fit.levels, strength=0.7, walk=1e-4))
     found = model_selection._predicted(flight.model, off, None, steady, steady)
     same = model_selection._predicted(flight.model, flight.state, None, steady, steady)
-    np.testing.assert_allclose(found.rows, same.rows, atol=1e-4)
-    np.testing.assert_allclose(found.links, same.links, atol=1e-4)
+    np.testing.assert_allclose(found.rows, same.rows, atol=SETTLED)
+    np.testing.assert_allclose(found.links, same.links, atol=SETTLED)
     assert found.weight.min() == 1.0
     assert np.sqrt(np.mean(found.rows**2)) < 0.3
+    levels = steady.levels
+    white = replace(levels, variance=levels.variance * levels.colour, colour=np.ones(6))
+    assert (levels.colour[1:] > 1.0).all()
+    as_dense = model_selection._predicted(flight.model, off, None, steady, replace(steady, levels=white))
+    np.testing.assert_allclose(as_dense.rows, found.rows, atol=SETTLED)
     louder = replace(steady, levels=replace(steady.levels, variance=4.0 * steady.levels.variance))
     quarter = model_selection._predicted(flight.model, flight.state, None, steady, louder)
     assert np.sqrt(np.mean(quarter.rows**2)) < np.sqrt(np.mean(same.rows**2))
+
+
+def test_a_prediction_holds_the_poses_too() -> None:
+    """Their residuals over the noise of the fit that gives the levels, of poses that are used in the part; the last
+    knot begins no interval."""
+    own = flight(translation_mps2=0.0)
+    vps = aligned(own)
+    given = with_vps(own, vps)
+    sharp = replace(own.levels, variance=np.full(6, 1e-8), colour=np.ones(6), strength=1e-2)
+    fit = replace(made(given), vps=vps, levels=sharp)
+    loud = replace(fit, vps=replace(vps, sigma_rad=2e-3))
+    left_out = replace(vps, used=vps.used & (np.arange(len(vps.used)) != 5))
+    poses = multiply(from_rotation_vector([3e-4, 0.0, 0.0]), vps.q)
+    off = replace(fit, vps=replace(vps, q=poses))
+    k = len(vps.used)
+    found = model_selection._predicted(given.model, given.state, left_out, off, loud)
+    assert found.links.shape == (k - 1, 12 + 3)
+    own_links = found.links[:, 12:]
+    assert not own_links[5].any()
+    # Vectors hold the attitude where poses of 2 mrad hardly count.
+    others = np.delete(own_links, 5, axis=0)
+    np.testing.assert_allclose(others, np.tile([0.15, 0.0, 0.0], (k - 2, 1)), atol=0.08)
+    without = model_selection._predicted(given.model, given.state, None, fit, fit)
+    assert without.links.shape == (k - 1, 12)
+    bare = replace(fit, vps=None)
+    for constants, noise in ((bare, fit), (fit, bare)):
+        assert model_selection._predicted(given.model, given.state, vps, constants, noise).links.shape[1] == 12
 
 
 def test_numbers_of_the_tests_are_told_plainly() -> None:
