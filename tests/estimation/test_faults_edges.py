@@ -11,6 +11,7 @@ from fieldcal.estimation.faults import (
     Fault,
     accelerometer_unit,
     channel_faults,
+    coarse_faults,
     gyroscope_unit,
     magnetometer_unit,
     sampling_faults,
@@ -116,6 +117,35 @@ def test_a_logger_that_froze_stands_on_all_axes(axis: int) -> None:
     x[100:141] = x[100]
     found = channel_faults("magnetometer", TICK_S * np.arange(300), x, "mG", None)
     assert [(f.code, f.axis) for f in found if f.axis == "xyz"[axis]] == [("stuck", "xyz"[axis])]
+
+
+@pytest.mark.parametrize("step", [1.0, 0.01, 50.0])
+@pytest.mark.parametrize(("n_levels", "coarse"), [(34, True), (35, False)])
+def test_a_step_of_a_tenth_of_the_spread_is_coarse(n_levels: int, coarse: bool, step: float) -> None:
+    """So many levels, each held five times as long as a sample, up and down: their sd is √((n² − 1)/12) steps."""
+    once = np.repeat(np.arange(float(n_levels)), 5)
+    x = step * np.tile(np.r_[once, once[::-1]], 4)
+    found = coarse_faults("gyroscope", np.stack([x, np.sin(np.arange(len(x))), x], axis=1), "rad/s")
+    assert [(f.axis, f.code, f.fatal) for f in found] == (
+        [("x", "coarse", True), ("z", "coarse", True)] if coarse else []
+    )
+    for fault in found:
+        assert fault.value == pytest.approx(1.0 / np.sqrt((n_levels**2 - 1) / 12.0))
+        assert fault.limit == 0.1
+        assert f"in steps of {step:.3g} rad/s where it varies by {step / fault.value:.3g} rad/s" in fault.sentence
+
+
+@pytest.mark.parametrize(("changes", "coarse"), [(300, True), (301, False)])
+def test_noise_over_steps_is_noise_where_three_in_ten_readings_differ(changes: int, coarse: bool) -> None:
+    changed = np.zeros(1000, bool)
+    changed[np.round(np.linspace(0, 999, changes)).astype(int)] = True
+    x = (-1.0) ** np.cumsum(np.r_[0, changed])
+    found = coarse_faults("gyroscope", np.stack([x, x, x], axis=1), "rad/s")
+    assert len(found) == (3 if coarse else 0)
+
+
+def test_a_channel_that_never_changes_is_not_called_coarse() -> None:
+    assert coarse_faults("gyroscope", np.ones((100, 3)), "rad/s") == []
 
 
 def levels(*counts: int, seed: int = 1) -> np.ndarray:
