@@ -2036,5 +2036,11 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "blocks = max(1, round(float(knots.interval_s.sum()) / BLOCK_S))",
         "1 → 2",
     ): "fewer than six are not looked at",
+    (
+        "exports.apply",
+        "raw_readings",
+        "return logged if p is None or o is None else np.linalg.solve(np.array(p), (logged - np.array(o)).T).T",
+        "or → and",
+    ): "both are known of a sensor, or neither",
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""
