@@ -2063,5 +2063,12 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "return logged if p is None or o is None else np.linalg.solve(np.array(p), (logged - np.array(o)).T).T",
         "or → and",
     ): "both are known of a sensor, or neither",
+    (
+        "estimation.joint.ladder",
+        "magnetometer_start",
+        "common = float(np.linalg.norm(readings.field_ned)) / max(length, 1e-300)",
+        "1e-300 → 1.1000000000000002e-300",
+    ): _GUARD,
+    ("estimation.wahba", "_quest_solution", "derivative = (4 * lam * lam - 2 * ab) * lam - c", "* → /"): _TURNED,
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

@@ -186,6 +186,7 @@ def test_a_clock_that_begins_again_goes_on(tmp_path: Path, unit: str, tick_ns: i
     frames, summary = read(tmp_path, lines(cells, readings(1600), NAMES.replace("t_s", f"t_{unit}")))
     assert frames["imu"]["t_ns"].to_list() == true_ns.tolist()
     assert [(f.code, f.count) for f in summary.findings] == [("clock_wrapped", 1)]
+    assert f"began again 1 time(s) after {period * tick_ns / S:.3f} s" in summary.findings[0].sentence
 
 
 @pytest.mark.parametrize("bits", [8, 12, 16])
