@@ -11,6 +11,7 @@ from fieldcal.estimation.faults import (
     Fault,
     accelerometer_unit,
     channel_faults,
+    coarse_faults,
     gyroscope_unit,
     magnetometer_unit,
     sampling_faults,
@@ -81,6 +82,70 @@ def test_all_that_it_stood_is_told_with_the_longest() -> None:
     value = float(np.sin(401))
     share = 100 * 104 / ticks
     assert f"stands at {value:.6g} mG for 3.0 s ({share:.1f} % of the recording" in fault.sentence
+
+
+@pytest.mark.parametrize(("jump", "stuck"), [(99, False), (100, True), (120, True), (140, True), (141, False)])
+def test_a_hold_is_a_stuck_channel_s_where_another_axis_moves_within_it(jump: int, stuck: bool) -> None:
+    """From the 100th sample to the 140th; a coarse sensor that lies still takes a step or two of its resolution."""
+    n = 300
+    x = np.sin(np.arange(n))
+    x[100:141] = x[100]
+    still = np.arange(n) % 2.0
+    still[jump] = 5.0
+    found = channel_faults(
+        "magnetometer", TICK_S * np.arange(n), np.stack([x, still, np.arange(n) % 3.0], axis=1), "mG", None
+    )
+    assert [f.code for f in found if f.axis == "x"] == (["stuck"] if stuck else [])
+
+
+@pytest.mark.parametrize(("steps", "stuck"), [(2.0, False), (3.0, True)])
+def test_two_steps_are_still(steps: float, stuck: bool) -> None:
+    n = 300
+    x = np.sin(np.arange(n))
+    x[100:141] = x[100]
+    beside = np.arange(n) % 2.0
+    beside[120] = steps
+    found = channel_faults(
+        "magnetometer", TICK_S * np.arange(n), np.stack([x, beside, np.arange(n) % 2.0], axis=1), "mG", None
+    )
+    assert [f.code for f in found if f.axis == "x"] == (["stuck"] if stuck else [])
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_logger_that_froze_stands_on_all_axes(axis: int) -> None:
+    x = np.stack([np.sin(np.arange(300.0) + i) for i in range(3)], axis=1)
+    x[100:141] = x[100]
+    found = channel_faults("magnetometer", TICK_S * np.arange(300), x, "mG", None)
+    assert [(f.code, f.axis) for f in found if f.axis == "xyz"[axis]] == [("stuck", "xyz"[axis])]
+
+
+@pytest.mark.parametrize("step", [1.0, 0.01, 50.0])
+@pytest.mark.parametrize(("n_levels", "coarse"), [(34, True), (35, False)])
+def test_a_step_of_a_tenth_of_the_spread_is_coarse(n_levels: int, coarse: bool, step: float) -> None:
+    """So many levels, each held five times as long as a sample, up and down: their sd is √((n² − 1)/12) steps."""
+    once = np.repeat(np.arange(float(n_levels)), 5)
+    x = step * np.tile(np.r_[once, once[::-1]], 4)
+    found = coarse_faults("gyroscope", np.stack([x, np.sin(np.arange(len(x))), x], axis=1), "rad/s")
+    assert [(f.axis, f.code, f.fatal) for f in found] == (
+        [("x", "coarse", True), ("z", "coarse", True)] if coarse else []
+    )
+    for fault in found:
+        assert fault.value == pytest.approx(1.0 / np.sqrt((n_levels**2 - 1) / 12.0))
+        assert fault.limit == 0.1
+        assert f"in steps of {step:.3g} rad/s where it varies by {step / fault.value:.3g} rad/s" in fault.sentence
+
+
+@pytest.mark.parametrize(("changes", "coarse"), [(300, True), (301, False)])
+def test_noise_over_steps_is_noise_where_three_in_ten_readings_differ(changes: int, coarse: bool) -> None:
+    changed = np.zeros(1000, bool)
+    changed[np.round(np.linspace(0, 999, changes)).astype(int)] = True
+    x = (-1.0) ** np.cumsum(np.r_[0, changed])
+    found = coarse_faults("gyroscope", np.stack([x, x, x], axis=1), "rad/s")
+    assert len(found) == (3 if coarse else 0)
+
+
+def test_a_channel_that_never_changes_is_not_called_coarse() -> None:
+    assert coarse_faults("gyroscope", np.ones((100, 3)), "rad/s") == []
 
 
 def levels(*counts: int, seed: int = 1) -> np.ndarray:

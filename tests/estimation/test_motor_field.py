@@ -131,6 +131,9 @@ def test_what_says_nothing() -> None:
     assert motor_field(h, np.full(len(h), 12.0), FIELD_UT) is None
     assert motor_field(h[:50], np.arange(50.0), FIELD_UT) is None
     assert motor_field(h * np.inf, np.arange(float(len(h))), FIELD_UT) is None
+    part = h.copy()
+    part[7, 1] = np.nan
+    assert motor_field(part, np.arange(float(len(h))), FIELD_UT) is None
 
 
 def result_of(share: float, p_value: float) -> MotorField:
@@ -151,6 +154,18 @@ def test_a_hundred_samples_are_the_fewest() -> None:
     assert result is not None
     assert result.slope == pytest.approx([0.1, 0.0, 0.0], abs=1e-6)
     assert result.span == pytest.approx(0.98)
+
+
+@pytest.mark.parametrize("slope", [0.1, 0.6])
+def test_the_sd_of_a_share_is_that_of_the_component_which_is_sure(slope: float) -> None:
+    """Along one axis; what is not sure on the others is not in the share, nor is what is not sure of it."""
+    rng = np.random.default_rng(10)
+    e, drive = rng.normal(size=(4000, 3)), rng.permutation(np.linspace(-0.5, 0.5, 4000))
+    h = e / np.linalg.norm(e, axis=1, keepdims=True) + 0.02 * rng.normal(size=e.shape)
+    result = motor_field(h + drive[:, None] * [slope, 0.0, 0.0], drive, 1.0)
+    assert result is not None
+    assert result.share == pytest.approx(slope * 0.98, rel=0.05)
+    assert result.share_sd == pytest.approx(result.slope_sd[0] * 0.98, rel=0.2)
 
 
 @pytest.mark.parametrize(

@@ -88,3 +88,13 @@ def test_reference_reading_by_the_kind_of_word() -> None:
     np.testing.assert_array_equal(sensor_model.default_reference_reading(unsigned, "counts"), [32768.0] * 3)
     np.testing.assert_array_equal(sensor_model.default_reference_reading(signed, "counts"), [0.0] * 3)
     np.testing.assert_array_equal(sensor_model.default_reference_reading(unsigned, "g"), [0.0] * 3)
+
+
+@pytest.mark.parametrize(
+    ("least", "median", "reference"), [(0, 16385, 32768.0), (0, 16384, 0.0), (-1, 16385, 0.0), (1, 20000, 32768.0)]
+)
+def test_words_that_are_never_negative_and_of_which_half_are_above_a_quarter_are_unsigned(
+    least: int, median: int, reference: float
+) -> None:
+    logged = np.array([[least] * 3, [median] * 3, [30000] * 3])
+    np.testing.assert_array_equal(sensor_model.default_reference_reading(logged, "counts"), [reference] * 3)

@@ -186,6 +186,7 @@ def test_a_clock_that_begins_again_goes_on(tmp_path: Path, unit: str, tick_ns: i
     frames, summary = read(tmp_path, lines(cells, readings(1600), NAMES.replace("t_s", f"t_{unit}")))
     assert frames["imu"]["t_ns"].to_list() == true_ns.tolist()
     assert [(f.code, f.count) for f in summary.findings] == [("clock_wrapped", 1)]
+    assert f"began again 1 time(s) after {period * tick_ns / S:.3f} s" in summary.findings[0].sentence
 
 
 @pytest.mark.parametrize("bits", [8, 12, 16])
@@ -356,6 +357,22 @@ def test_what_changes_seldom_tells_no_imus_apart() -> None:
     assert interleaved(pl.Series(["a"] * 20 + ["b"] * 20)) == []
     assert interleaved(pl.Series([str(i) for i in range(40)])) == []
     assert interleaved(alternating[:19]) == []
+    assert interleaved(alternating[:20]) == ["a", "b"]
+
+
+@pytest.mark.parametrize(("units", "told"), [(2, True), (8, True), (9, False)])
+def test_eight_imus_are_the_most_that_are_told_apart(units: int, told: bool) -> None:
+    names = [f"imu{i}" for i in range(units)]
+    assert interleaved(pl.Series(names * 10)) == (names if told else [])
+
+
+@pytest.mark.parametrize(("switches", "told"), [(8, False), (9, True)])
+def test_imus_alternate_where_more_than_a_fifth_of_the_rows_is_another_s(switches: int, told: bool) -> None:
+    """Of forty rows with a name; blanks and rows without one do not count."""
+    held = [name for i in range(switches) for name in ["a", "b"][i % 2]]
+    rows = held + [["a", "b"][switches % 2]] * (40 - switches)
+    cells = pl.Series([f" {name} " for name in rows] + [None] * 100)
+    assert interleaved(cells) == (["a", "b"] if told else [])
 
 
 # visual positioning system -------------------------------------------------------------------------------------------

@@ -261,6 +261,14 @@ def test_what_is_a_row_and_what_is_counted_as_lost() -> None:
     }  # fmt: skip
 
 
+def test_two_slashes_begin_a_comment_and_one_does_not() -> None:
+    """One alone is a row of one cell."""
+    cells, numbers, losses = rows("//,2,3\n/,2,3\na/b,5,6\n//\n7,8,9\n/4,5\n1/,2\n/\n")
+    assert cells == [("/", "3"), ("a/b", "6"), ("7", "9")]
+    assert numbers == [12, 13, 15]
+    assert losses.counts == {ReasonCode.RAGGED_ROW: 3}
+
+
 def test_quotes_are_resolved_and_those_that_do_not_close_cost_their_row() -> None:
     cells, numbers, losses = rows('"1","2","3"\n4,"x, y",6\n"7,8,9\n10,"a""b",12\n1,"2"x,3\n')
     assert cells == [("1", "3"), ("4", "6"), ("10", "12")]

@@ -12,7 +12,7 @@ from dataflash_support import DataflashFlight, by_pymavlink
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.dataflash import file as dataflash_file
 from fieldcal.logs.dataflash.file import DataflashFile
-from fieldcal.logs.dataflash.records import LETTERS, parse_fmt
+from fieldcal.logs.dataflash.records import LETTERS, multipliers, parse_fmt
 
 FMT = struct.Struct("<3sBB4s16s64s")
 EXTREMES = {
@@ -98,6 +98,25 @@ def test_a_multiplier_applies_to_stored_integers_only(tmp_path: Path) -> None:
     assert mag.in_unit("TimeUS")[0] == pytest.approx(mag.integers("TimeUS")[0] * 1e-6)
     assert np.array_equal(gps.in_unit("Alt"), gps.integers("Alt") / 100)  # FMTU says 0.01 too: once
     assert np.array_equal(imu.in_unit("GyrX"), imu.stored("GyrX").astype(float))
+
+
+@pytest.mark.parametrize("missing", ["", "FmtType", "MultIds", "Id", "Mult"])
+def test_multipliers_need_every_column_of_both_messages(tmp_path: Path, missing: str) -> None:
+    """Of FMTU types and letters, of MULT letters and factors: without one of them there is no multiplier."""
+    formats, values = {"FmtType": "B", "MultIds": "N"}, {"Id": "b", "Mult": "d"}
+    content = own_fmt()
+    sizes = {"B": 1, "N": 16, "b": 1, "d": 8}
+    for type_id, name, columns in ((200, "FMTU", formats), (201, "MULT", values)):
+        kept = {column: letter for column, letter in columns.items() if column != missing}
+        length = 3 + sum(sizes[letter] for letter in kept.values())
+        content += fmt(type_id, length, name, "".join(kept.values()), ",".join(kept))
+        packed = {"FmtType": b"\xc9", "MultIds": b"-A".ljust(16, b"\0"), "Id": b"A", "Mult": struct.pack("<d", 0.01)}
+        content += struct.pack("<2sB", b"\xa3\x95", type_id) + b"".join(packed[column] for column in kept)
+    (tmp_path / "a.bin").write_bytes(content)
+    file = DataflashFile(tmp_path / "a.bin")
+    file.locate({"FMTU", "MULT"})
+    found = multipliers(file.rows("FMTU"), file.rows("MULT"), file.layouts)
+    assert found == ({} if missing else {201: {"Mult": 0.01}})
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,22 @@ from fieldcal.errors import UnreadableLog
 from fieldcal.logs import log_format, log_sha256, read_log
 from fieldcal.logs.interface import Finding, LogSummary
 from fieldcal.logs.rosbag2.metadata import read_metadata
+from fieldcal.logs.rosbag2.parts import is_bag_folder
 from fieldcal.logs.rosbag2.rows import Rows, open_read_only
+
+
+@pytest.mark.parametrize(
+    ("names", "bag"),
+    [(("bag_0.mcap", "bag_1.mcap"), True), (("bag_0.mcap", "other.mcap"), False), (("bag.mcap",), False), ((), False)],
+)
+def test_without_metadata_every_file_is_named_after_its_folder(
+    tmp_path: Path, names: tuple[str, ...], bag: bool
+) -> None:
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    for name in names:
+        (folder / name).touch()
+    assert is_bag_folder(folder) == bag
 
 
 def codes(summary: LogSummary) -> dict[str, Finding]:

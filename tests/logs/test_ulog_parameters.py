@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega
 from ulog_support import ACCEL_ID, GYRO_ID, MAG_ID, changed
 
 from fieldcal.logs.ulog.parameters import History, corrected, correction, corrections, slot_of, uncorrected
@@ -51,6 +53,21 @@ def test_numbered_rotations_turn_the_axes_as_px4_writes_them_out(number: int, of
         expected = np.zeros(3)
         expected["xyz".index(board[1])] = 1.0 if board[0] == "+" else -1.0
         np.testing.assert_allclose(rotation(number) @ sensed, expected, atol=1e-15)
+
+
+def test_rotations_of_recent_firmware_are_those_of_mavlinks_names() -> None:
+    checked = 0
+    for number, entry in ardupilotmega.enums["MAV_SENSOR_ORIENTATION"].items():
+        if number > 40:
+            continue
+        angles = {axis: float(degrees) for axis, degrees in re.findall(r"(ROLL|PITCH|YAW)_(\d+)", entry.name)}
+        expected = turned(*(angles.get(axis, 0.0) for axis in ("ROLL", "PITCH", "YAW")))
+        for release in (None, 0x010C0000):
+            np.testing.assert_allclose(rotation(number, release), expected, atol=1e-12, err_msg=entry.name)
+        if number < 26:
+            np.testing.assert_allclose(rotation(number, 0x010BFFFF), expected, atol=1e-12, err_msg=entry.name)
+        checked += 1
+    assert checked == 41
 
 
 def test_a_rotation_that_there_is_not_is_none_and_old_firmware_had_other_numbers() -> None:

@@ -340,6 +340,13 @@ def test_a_receiver_without_a_fix_tells_neither_date_nor_place(tmp_path: Path) -
     assert not summary.epoch_known
 
 
+def test_how_far_fixes_disagree_about_the_time_is_told(tmp_path: Path) -> None:
+    rows = gnss(times_us(1.0, 5.0), UTC_MINUS_BOOT_US)
+    rows.columns["time_utc_usec"][:2] += np.array([-20_000, 30_000]).astype(np.uint64)
+    _, summary = read_topics(tmp_path, [flight(1.0)[0], rows])
+    assert summary.metadata["utc_from"] == "vehicle_gps_position, 5 fixes, -20 to +30 ms about their median"
+
+
 def test_the_loggers_own_note_of_the_time_stands_in(tmp_path: Path) -> None:
     infos = {"boot_time_utc_us": UTC_MINUS_BOOT_US}
     tables, summary = read_topics(tmp_path, [flight(1.0)[0]], infos=infos)

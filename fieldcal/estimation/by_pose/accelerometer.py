@@ -84,37 +84,38 @@ def fit_accelerometer(
     seen = np.isfinite(path).all(axis=1)
     at, path, turn = np.asarray(t_vps, dtype=float)[seen], path[seen], np.asarray(q, dtype=float)
     valid = np.isfinite(x).all(axis=1)
-    fits: list[tuple[Array, Array, TriadByPose]] = []
-    centre, spread = np.zeros(3), 1.0
     if len(at) > 4 and valid.any():
         centre, spread = x[valid].mean(axis=0), float(np.maximum(x[valid].std(axis=0).max(), 1e-300))
         x = (x - centre) / spread
         fastest = 1.0 / (LEAST_SAMPLES_A_PERIOD * float(np.median(np.diff(at))))
         cutoffs = sorted({min(f, fastest) for f in CUTOFFS_HZ}, reverse=True)
+        fits = []
         for cutoff_hz in cutoffs:
             # Slower motion is known across longer gaps.
             gap_s = max(max_gap_s, BRIDGED_PERIODS / cutoff_hz)
             rows = _rows(times, segment, x, valid, turn, at, path, gravity_mps2, gap_s, cutoff_hz)
             if sum(len(y) for _, y in rows) >= FEWEST_ROWS:
                 columns, y = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-                fits.append(_solved(columns, y, centre, spread, abs(gravity_mps2)))
-    if not fits:
-        raise UnusableFlight(
-            ReasonCode.VPS_TOO_SHORT, "The VPS has too few positions without gaps to compare accelerations with."
-        )
-    return _best(fits, centre, spread)
+                fits.append(_solved(columns, y, abs(gravity_mps2)))
+        if fits:
+            return _best(fits, centre, spread)
+    raise UnusableFlight(
+        ReasonCode.VPS_TOO_SHORT, "The VPS has too few positions without gaps to compare accelerations with."
+    )
 
 
-def _best(fits: list[tuple[Array, Array, TriadByPose]], centre: Array, spread: float) -> TriadByPose:
-    values = np.array([value for value, _, _ in fits])
+def _best(fits: list[TriadByPose], centre: Array, spread: float) -> TriadByPose:
+    """Of fits to centred readings, the lowest cut-off last: the best known, in logged units."""
+    values = np.array([np.r_[fit.matrix.ravel(), fit.bias] for fit in fits])
     scales = [0, 4, 8]
-    variance = np.array([np.diagonal(covariance)[scales] for _, covariance, _ in fits])
+    variance = np.array([np.diagonal(fit.covariance)[scales] for fit in fits])
     error = np.sqrt(variance + (values - values[-1])[:, scales] ** 2)
-    value, covariance, fit = fits[int(np.argmin(error.max(axis=1)))]
+    best = int(np.argmin(error.max(axis=1)))
+    fit = fits[best]
     to_logged = _to_logged(centre, spread)
     systematic = 0.5 * np.ptp(values, axis=0)
-    covariance = to_logged @ (covariance + np.diag(systematic**2)) @ to_logged.T
-    logged = to_logged @ value
+    covariance = to_logged @ (fit.covariance + np.diag(systematic**2)) @ to_logged.T
+    logged = to_logged @ values[best]
     return replace(fit, matrix=logged[:9].reshape(3, 3), bias=logged[9:], covariance=covariance)
 
 
@@ -150,8 +151,6 @@ def _rows(
             if thinning > 1:
                 both = low_pass(both, MOTION_HZ, own_interval_s, side_s=THINNING_SIDE_S)[::thinning]
             at = t[inside[0]] + interval_s * np.arange(len(both))
-            if len(at) < 20:
-                continue
             reading, turn = both[:, :3], both[:, 3:].reshape(-1, 3, 3).transpose(0, 2, 1)
             slope = differentiate_samples(at, reading)
             path = CubicSpline(t_vps[c:d], position[c:d])(at)
@@ -181,9 +180,8 @@ def _second_derivative(x: Array, interval_s: float) -> Array:
     return out
 
 
-def _solved(columns: Array, y: Array, centre: Array, spread: float, g: float) -> tuple[Array, Array, TriadByPose]:
-    """Robust regression: matrix by rows and bias of the centred readings (12,), their covariance, and the rest; the
-    delay's column is made of the matrix before it."""
+def _solved(columns: Array, y: Array, g: float) -> TriadByPose:
+    """Robust regression: the triad for centred readings. The delay's column is made of the matrix before it."""
     x = np.zeros((*y.shape, UNKNOWNS))
     x[..., :LATE], x[..., LATE + 1 :] = columns[..., :LATE], columns[..., 21:]
     theta: Array = np.zeros(UNKNOWNS)
@@ -206,10 +204,10 @@ def _solved(columns: Array, y: Array, centre: Array, spread: float, g: float) ->
     root = np.sqrt(weight)[:, None]
     _, covariance = least_squares_covariance(x * root[..., None], residual * root)
     sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    rest = TriadByPose(
-        matrix=np.eye(3),
-        bias=np.zeros(3),
-        covariance=np.eye(12),
+    return TriadByPose(
+        matrix=theta[:9].reshape(3, 3),
+        bias=theta[9:12],
+        covariance=covariance[:12, :12],
         delay_s=float(theta[LATE]),
         delay_sd_s=float(sd[LATE]),
         misfit=float(np.sqrt(np.average(np.sum(residual**2, axis=1), weights=weight)) / g),
@@ -218,7 +216,6 @@ def _solved(columns: Array, y: Array, centre: Array, spread: float, g: float) ->
         lever_arm_m=theta[LATE + 1 : LATE + 4],
         lever_arm_sd_m=sd[LATE + 1 : LATE + 4],
     )
-    return theta[:12], covariance[:12, :12], rest
 
 
 def _to_logged(centre: Array, spread: float) -> Array:

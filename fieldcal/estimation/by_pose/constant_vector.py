@@ -116,7 +116,7 @@ def _blocks(t: Array, segment: np.ndarray, logged: Array, q: Array, known: np.nd
             slope[valid] = differentiate_samples(t[valid], logged[valid], window_s=BLOCK_S)
     at = np.flatnonzero(usable)
     if not len(at):
-        return np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3))
+        return logged[at], body_from_inertial(q[at]), slope[at]
     block = np.unique(np.floor((t[at] - t[0]) / BLOCK_S) + 1e9 * segment[at], return_inverse=True)[1]
     count = np.bincount(block).astype(float)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fieldcal.geometry.rotation import IDENTITY, Array, body_from_inertial, from_matrix
+from fieldcal.geometry.rotation import Array, body_from_inertial, from_matrix
 
 
 def mean_in_world(q: ArrayLike, vectors: ArrayLike) -> Array:
@@ -36,4 +36,4 @@ def ned_from_world(down: ArrayLike | None, field: ArrayLike | None, field_ned: A
         turn = np.arctan2(true[1], true[0]) - np.arctan2(seen[1], seen[0])
         c, s1 = np.cos(turn), np.sin(turn)
         total = np.array([[c, -s1, 0.0], [s1, c, 0.0], [0.0, 0.0, 1.0]]) @ total
-    return IDENTITY if np.array_equal(total, np.eye(3)) else from_matrix(total.T)
+    return from_matrix(total.T)

@@ -58,7 +58,7 @@ def covariance(
     inverse = inverse_information(information)
     k, r, p = len(response), whitening.shape[1], len(information)
     sensitivity, residual, count = np.zeros((k, r + 3, p)), np.zeros((k, r + 3)), np.zeros((k, r + 3))
-    residual[:-1, r:], count[:-1, r:] = jumps[0] * jumps[1][:, None], 1.0
+    residual[:-1, r:] = jumps[0] * jumps[1][:, None]
     sensitivity[:-1, r:] = np.diff(response[:, :3], axis=0)
     score = np.zeros((k, p))
     for knot_span, rows, ends in chunks:

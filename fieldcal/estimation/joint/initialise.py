@@ -174,9 +174,8 @@ def _turned_to(r: Readings, vectors: Mapping[str, Array]) -> Array:
     down = np.array([0.0, 0.0, float(np.sign(r.gravity_mps2))])
     if len(vectors) == 2:
         both = np.stack([vectors["magnetometer"], vectors["accelerometer"]], axis=1)
-        heading = float(np.arctan2(r.field_ned[1], r.field_ned[0]))
         reference = np.array([r.field_ned, down])
-        return wahba.attitudes(both, reference, np.array([0.02, 0.02]), declination=heading).q
+        return wahba.attitudes(both, reference, np.array([0.02, 0.02])).q
     ((name, vector),) = vectors.items()
     seen = vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)
     true = r.field_ned / np.linalg.norm(r.field_ned) if name == "magnetometer" else down

@@ -66,11 +66,9 @@ def _since_knots(knots: Knots, steps: Array) -> tuple[Array, Array]:
     between samples: one running product for all intervals side by side."""
     count = np.diff(knots.index)
     step = np.arange(int(count.max()))[:, None]
-    by_interval = np.where(
-        ((step < count) & knots.joined)[..., None], steps[np.minimum(knots.index[:-1] + step, len(steps) - 1)], IDENTITY
-    )
+    by_interval = steps[np.minimum(knots.index[:-1] + step, len(steps) - 1)]  # what is behind an interval is not read
     total = np.empty((len(step) + 1, len(count) + 1, 4))
-    total[0], total[:, -1] = IDENTITY, IDENTITY
+    total[0] = IDENTITY
     for i in range(len(step)):
         total[i + 1, :-1] = multiply(total[i, :-1], by_interval[i])
     offset = np.arange(len(steps) + 1) - knots.index[knots.of_sample]
@@ -126,7 +124,7 @@ def _slow_rate(model: Model, path: Trajectory, span: slice) -> Array:
     """Running mean of the rate over 2 RATE_SIDE_S, (m, 3): the gyroscope's noise would bias the delay."""
     at = model.at[span]
     side = max(1, round(RATE_SIDE_S / model.knots.sample_s))
-    first, last = max(int(at[0]) - side, 0), min(int(at[-1]) + side + 1, len(path.rate))
+    first, last = max(int(at[0]) - side, 0), int(at[-1]) + side + 1
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(path.rate[first:last], axis=0)])
     low, high = np.maximum(at - side - first, 0), np.minimum(at + side + 1 - first, len(total) - 1)
     return np.asarray((total[high] - total[low]) / (high - low)[:, None])
@@ -288,7 +286,7 @@ def accumulate(
     np.multiply(rows.by_parameter, root[..., None], out=others[..., :p])
     np.multiply(rows.residual, root, out=others[..., p])
     np.multiply(rows.by_rotation * root[..., None], probe.bridge[rows.span, None], out=others[..., p + 1 :])
-    np.multiply(probe.sensors[rows.span], root > 0, out=probes_of_row[..., 0])
+    probes_of_row[..., 0] = probe.sensors[rows.span]
     np.sum(others[..., p + 1 :], axis=2, out=probes_of_row[..., 1])
     by_interval = np.take(columns, _padded(model, rows.span, knot_span), axis=0)  # (knots, most rows, r, 18 + p)
     by_row = by_interval.transpose(0, 2, 3, 1)

@@ -241,7 +241,7 @@ def _gain(model: Model, without: _Prediction, term: _Prediction) -> float:
     blocks = max(1, round(float(knots.interval_s.sum()) / BLOCK_S))
     if blocks < FEWEST_BLOCKS:
         return 0.0
-    of_knot = np.minimum(np.arange(len(knots.index)) * blocks // len(knots.index), blocks - 1)
+    of_knot = np.arange(len(knots.index)) * blocks // len(knots.index)
     drop, changed = np.zeros(blocks), np.zeros(blocks)
     for a, b, weight, block in (
         (without.rows, term.rows, without.weight, of_knot[knots.of_sample[model.at]]),

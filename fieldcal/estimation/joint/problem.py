@@ -172,9 +172,7 @@ class Model:
         given = {name: getattr(readings, name) for name in TRIADS}
         triads = {name: Centred.of(x) for name, x in given.items() if x is not None and np.isfinite(x).any()}
         vectors = tuple(name for name in TRIADS[1:] if name in triads)
-        at = np.concatenate(
-            [np.arange(a + side, b - side, 2 * side + 1) for a, b in run_bounds(readings.segment) if b - a > 2 * side]
-        )
+        at = np.concatenate([np.arange(a + side, b - side, 2 * side + 1) for a, b in run_bounds(readings.segment)])
         triads = {name: x.averaged(at, side) if name in vectors else x for name, x in triads.items()}
         # Nothing is compared at the rows of a model without vectors: one an interval will do.
         return cls(readings, triads, knots, vectors, at if vectors else knots.index)

@@ -73,3 +73,37 @@ def test_too_little_says_nothing() -> None:
         assert bias_walk(rates(5, n, STEP_S), np.full(n, STEP_S), np.ones(n, dtype=bool)) == 0.0
     assert bias_walk(np.zeros((300, 3)), np.full(300, STEP_S), np.ones(300, dtype=bool)) == 0.0
     assert bias_walk(rates(6, 3, STEP_S), np.full(3, STEP_S), np.zeros(3, dtype=bool)) == 0.0
+
+
+def waves(n: int, *strengths: float) -> NDArray[np.float64]:
+    """Rates whose slow cosine coefficients are so strong, from the first on: in phase with none of the others."""
+    k = np.arange(1, len(strengths) + 1)
+    shape = np.cos(np.pi * k * (np.arange(n)[:, None] + 0.5) / n) * np.sqrt(2.0 / n)
+    return np.repeat((shape @ np.array(strengths))[:, None], 3, axis=1)
+
+
+def test_two_coefficients_of_a_period_of_four_seconds_and_more_are_enough() -> None:
+    """The k-th has the period 2 n Δt / k: of 50 steps of 0.08 s the second one's is 4 s, of 49 steps it is shorter."""
+    for n, told in ((50, True), (49, False)):
+        assert (bias_walk(waves(n, 1.0, 0.5), np.full(n, STEP_S), np.ones(n, dtype=bool)) > 0.0) == told
+
+
+def test_twelve_coefficients_count_and_no_more() -> None:
+    """A walk in the first twelve is told whatever is in the thirteenth, and is none if the twelfth stands out."""
+    n = 4000
+    walk = [1.0 / k for k in range(1, 13)]
+    given = np.full(n, STEP_S), np.ones(n, dtype=bool)
+    plain = bias_walk(waves(n, *walk), *given)
+    assert plain > 0.0
+    assert np.isclose(bias_walk(waves(n, *walk, 30.0), *given), plain)
+    assert bias_walk(waves(n, *walk[:11], 30.0), *given) == 0.0
+
+
+def test_exact_coefficients_of_a_walk_tell_it() -> None:
+    """A walk of unit density has the variance Δt/(4 sin²(πk/2n)) in its k-th coefficient: without white noise, to half
+    a step of the search."""
+    n = 300
+    k = np.arange(1, 13)
+    strengths = 0.5 * WALK * np.sqrt(STEP_S) / np.sin(0.5 * np.pi * k / n)
+    found = bias_walk(waves(n, *strengths), np.full(n, STEP_S), np.ones(n, dtype=bool))
+    assert np.isclose(found, WALK, rtol=GRID)
