@@ -8,8 +8,8 @@ where the log holds counts) and the VPS's clock (`vps.apparent_offset_s`). Every
 
 One Markdown row a log: open-loop drift, rms angle against the optical attitude with the gyroscope as logged, after the
 serial chain, after the estimate, with the reference constants; error of the VPS's lag, ms, and, where its skew is
-known, of that, ppm; then for each triad and axis the error of scale and zero. In brackets each over the sd of both sides. "–" is a
-refused row. Below, the rms of all published rows over their sd.
+known, of that, ppm; then for each triad and axis the error of scale and zero. In brackets each over the sd of both
+sides. "–" is a refused row. Below, the rms of all published rows over their sd.
 
 The lag's reference (`imu_lag_s`) was fitted to each recording as ours is, and is the less exact of the two: what it
 differs from one recording of an IMU to the next is more than any sensor's delay can. So the last line but one judges
