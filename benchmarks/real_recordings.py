@@ -7,9 +7,14 @@ ARCHIVE holds fieldcal.toml and `expected.json` with the reference constants: of
 where the log holds counts) and the VPS's clock (`vps.apparent_offset_s`). Every log with one of them is calibrated.
 
 One Markdown row a log: open-loop drift, rms angle against the optical attitude with the gyroscope as logged, after the
-serial chain, after the estimate, with the reference constants; error of the VPS's lag; then for each triad and axis the
-error of scale and zero and, in brackets, over the sd of both sides. "–" is a refused row. Below, the rms of all
-published rows over their sd.
+serial chain, after the estimate, with the reference constants; error of the VPS's lag, ms, and, where its skew is
+known, of that, ppm; then for each triad and axis the error of scale and zero. In brackets each over the sd of both
+sides. "–" is a refused row. Below, the rms of all published rows over their sd.
+
+The lag's reference (`imu_lag_s`) was fitted to each recording as ours is, and is the less exact of the two: what it
+differs from one recording of an IMU to the next is more than any sensor's delay can. So the last line but one judges
+the lags by that alone: over logs of one `source` whose clock's offset is invented (`vps.offset_s`), the delay of the
+IMU has to be the same; its weighted mean, and what each lag differs from the mean of the others over both their sd.
 """
 
 from __future__ import annotations
@@ -52,7 +57,10 @@ def main() -> None:
     given = parser.parse_args()
     changes = {"method": given.method, "use_vps": False if given.without_vps else "auto"}
     ratios: dict[str, list[float]] = defaultdict(list)
-    print("| log | s | rung | drift raw, serial, estimate, reference ° | lag ms | gyroscope | accelerometer |")
+    delays: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    print(
+        "| log | s | rung | drift raw, serial, estimate, reference ° | lag ms, skew ppm | gyroscope | accelerometer |"
+    )
     print("|---|---|---|---|---|---|---|")
     for archive in given.archive:
         expected = json.loads((archive / "expected.json").read_text())
@@ -67,9 +75,16 @@ def main() -> None:
             began = time.perf_counter()
             results = run_flight(signals, settings)
             print(row(name, entry, results, settings, time.perf_counter() - began, ratios), flush=True)
+            if (own := delay(results, entry)) is not None:
+                delays[str(entry.get("source", "")).split("/")[0]].append(own)
     for quantity, values in ratios.items():
         z = np.abs(values)
         print(f"\n{quantity}: {len(z)} rows, error ÷ sd rms {np.sqrt(np.mean(z**2)):.2f}, largest {z.max():.1f}")
+    for source, own in delays.items():
+        if len(own) > 1:
+            mean, sd, z = one_delay(*np.array(own).T)
+            print(f"\ndelay of the IMU, {source}: {len(own)} logs, {1e3 * mean:.3f} ± {1e3 * sd:.3f} ms,", end=" ")
+            print(f"each against the others ÷ sd rms {np.sqrt(np.mean(z**2)):.2f}, largest {np.abs(z).max():.1f}")
 
 
 def truth_of(entry: dict[str, Any], sensor: Sensor) -> Truth | None:
@@ -161,15 +176,44 @@ def errors(rows: pl.DataFrame, sensor: Sensor, axis: str, i: int, truth: Truth, 
 
 
 def lag(results: dict[str, StageResult], entry: dict[str, Any], ratios: dict[str, list[float]]) -> str:
-    """At mid-flight, where its sd holds."""
+    """At mid-flight, where its sd holds, and the skew."""
     sync, clock = results["vps_sync"].tables.get("sync"), entry.get("vps", {})
     true = clock.get("apparent_offset_s", clock.get("vps_minus_imu_s"))
     if sync is None or true is None or sync["lag_mid_s"][0] is None:
         return "–"
     middle = true + 1e-6 * clock.get("skew_ppm", 0.0) * 0.5 * entry["duration_s"]
     error, sd = 1e3 * (sync["lag_mid_s"][0] + middle), 1e3 * sync["lag_sd_s"][0]
-    ratios["lag"].append(error / sd)
-    return f"{error:+.3f} ± {sd:.3f}"
+    z = error / np.hypot(sd, 1e3 * reference_lag_sd_s(entry))
+    ratios["lag"].append(z)
+    told = f"{error:+.3f} ± {sd:.3f} ({z:+.1f})"
+    if "skew_ppm" not in clock:
+        return told
+    wrong, skew_sd = sync["skew_ppm"][0] - clock["skew_ppm"], sync["skew_sd_ppm"][0]
+    ratios["skew"].append(wrong / skew_sd)
+    return f"{told}, {wrong:+.2f} ± {skew_sd:.2f} ({wrong / skew_sd:+.1f})"
+
+
+def reference_lag_sd_s(entry: dict[str, Any]) -> float:
+    truth = entry["truth"]
+    return float(truth.get("gyro", truth.get("gyro_fit_after_nominal", {})).get("imu_lag_sd_s", 0.0))
+
+
+def delay(results: dict[str, StageResult], entry: dict[str, Any]) -> tuple[float, float] | None:
+    """Of the IMU behind the VPS, s, and its sd: the lag less the offset that was given to the VPS's clock."""
+    sync, clock = results["vps_sync"].tables.get("sync"), entry.get("vps", {})
+    if sync is None or "offset_s" not in clock or sync["lag_mid_s"][0] is None:
+        return None
+    middle = clock["offset_s"] + 1e-6 * clock["skew_ppm"] * 0.5 * entry["duration_s"]
+    return sync["lag_mid_s"][0] + middle, sync["lag_sd_s"][0]
+
+
+def one_delay(delay_s: np.ndarray, sd_s: np.ndarray) -> tuple[float, float, np.ndarray]:
+    """Weighted mean, its sd, and each (n,) less the mean of the others over the sd of both."""
+    weight = sd_s**-2.0
+    total = weight.sum()
+    mean = float(weight @ delay_s / total)
+    others = (weight @ delay_s - weight * delay_s) / (total - weight)
+    return mean, float(total**-0.5), (delay_s - others) / np.sqrt(sd_s**2 + 1.0 / (total - weight))
 
 
 def drift_of(

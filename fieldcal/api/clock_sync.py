@@ -30,7 +30,9 @@ class Synchronisation(SyncFit):
     skew_ppm : float
         Drift, ppm, positive when the VPS clock is fast; `skew_sd_ppm` its standard deviation.
     covariance : (2, 2) array
-        Of the lag at mid-record, s, and the skew (a ratio).
+        Of the lag at mid-record, s, and the skew (a ratio), of noise alone.
+    spread : (2,) array
+        Half of what both differ from those by slower motion, beyond chance; it is in `lag_sd_s` and `skew_sd_ppm`.
     peak, runner_up : float
         Correlation of the rotation rates at the lag, and the best one away from it; `peak_width_s`.
     explained : float

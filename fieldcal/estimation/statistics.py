@@ -14,6 +14,7 @@ HUBER = 1.345
 # Blocks taken for independent: at least so long, which is longer than a hand's motion remembers, and so few that their
 # spread can still be estimated.
 BLOCK_S, BLOCKS, FEWEST_BLOCKS = 2.0, 20, 6
+LEAST_LOCAL_SHARE = 0.05  # of a residual's rms: what is locally less is taken for so much
 
 
 def robust_sigma(residual: ArrayLike) -> float:
@@ -106,11 +107,14 @@ def colour(residual: ArrayLike) -> float:
     return float(np.mean([len(r) / max(independent_samples(column), 1e-9) for column in r.T]))
 
 
-def least_squares_covariance(sensitivity: ArrayLike, residual: ArrayLike, *, nuisance: int = 0) -> tuple[Array, Array]:
+def least_squares_covariance(
+    sensitivity: ArrayLike, residual: ArrayLike, *, nuisance: int = 0, steady_over: int | None = None
+) -> tuple[Array, Array]:
     """Covariances of a least-squares fit: (Cramér–Rao σ²M⁻¹, coloured M⁻¹[ΣΣ Sᵀ𝓡S]M⁻¹), each (p, p).
 
     `sensitivity` (n, c, p) and `residual` (n, c) as in `coloured_information`; `nuisance` counts parameters that were
-    eliminated beforehand. Publish the second.
+    eliminated beforehand. `steady_over`: samples over which the residual's size is the same, None for all: where both
+    it and the sensitivity are larger in motion than at rest, the rest says nothing of the errors. Publish the second.
     """
     s, r = np.asarray(sensitivity, dtype=float), np.asarray(residual, dtype=float)
     n, channels, p = s.shape
@@ -120,9 +124,17 @@ def least_squares_covariance(sensitivity: ArrayLike, residual: ArrayLike, *, nui
     inverse = np.linalg.pinv((flat / scale).T @ (flat / scale), hermitian=True) / np.outer(scale, scale)
     sigma_squared = float(np.sum(r * r)) / max(1, n * channels - p)
     # p parameters a channel took from the variance of n_e independent samples: n_e/(n_e − p), at most 4.
-    middle, independent = _coloured(s, r)
+    size = np.ones(n) if steady_over is None else _local_size(r, steady_over)
+    middle, independent = _coloured(s * size[:, None, None], r / size[:, None])
     freedom = min(independent / max(independent - (p + nuisance) / channels, 1e-9), 4.0)
     return sigma_squared * inverse, inverse @ (freedom * middle) @ inverse
+
+
+def _local_size(r: Array, window: int) -> Array:
+    """Rms of residuals r (n, c) over `window` samples about each, (n,), as a share of the rms of all."""
+    square, ones = np.mean(r * r, axis=1), np.ones(min(window, len(r)))
+    local = np.convolve(square, ones, mode="same") / np.convolve(np.ones(len(r)), ones, mode="same")
+    return np.sqrt(np.maximum(local / max(float(square.mean()), 1e-300), LEAST_LOCAL_SHARE**2))
 
 
 def variance_by_blocks(pull: ArrayLike, t: ArrayLike) -> Array:

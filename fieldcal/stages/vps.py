@@ -120,7 +120,7 @@ def _refined(
         "synchronised_by": "gyroscope" if refined is fit else "gyroscope and magnetometer",
         # Positive: the magnetometer's readings are older than the gyroscope's.
         "magnetometer_delay_s": field_clock.lag_mid_s - fit.lag_mid_s,
-        "magnetometer_delay_sd_s": float(np.sqrt(field_clock.covariance[0, 0] + fit.covariance[0, 0])),
+        "magnetometer_delay_sd_s": float(np.hypot(np.sqrt(field_clock.covariance[0, 0]), fit.lag_sd_s)),
     }
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numerics_support import angle, constants, logged, random_attitudes, rms
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.clock_sync import by_rates
-from fieldcal.geometry.rotation import from_euler, from_rotation_vector, multiply
+from fieldcal.estimation.gyroscope.output_error import propagate_stretches
+from fieldcal.geometry.rotation import from_euler, from_rotation_vector, multiply, normalise
 from fieldcal.simulation.experiment import Experiment, Motion
 
 IMU_INTERVAL_S, VPS_INTERVAL_S = 1.0 / 185.0, 1.0 / 350.0
@@ -272,6 +274,54 @@ def test_claimed_sd_of_lag_and_drift_is_honest(gyro_noise: float, vps_noise: flo
     lag, skew = np.array(ratios).T
     assert HONEST[0] < rms(lag) < HONEST[1]
     assert HONEST[0] < rms(skew) < HONEST[1]
+
+
+def test_noise_that_grows_with_the_motion_is_in_the_sd() -> None:
+    """Half of the record is rest; the average over it would understate the sd twice."""
+    ratios = []
+    for seed in range(12):
+        t, rate, stamps, q = record(seed, gyro_noise=0.0)
+        over_a_second = np.convolve(np.sum(rate**2, axis=1), np.full(185, 1.0 / 185.0), mode="same")
+        noise = 1e-3 + 0.05 * np.sqrt(over_a_second)[:, None]
+        noisy = rate + noise * np.random.default_rng(1000 + seed).normal(size=rate.shape)
+        fit = by_rates.synchronise(t, noisy, stamps, q)
+        middle_error = fit.lag_mid_s + 0.37 + 20.0 * PPM * fit.reference_s
+        ratios.append([middle_error / fit.lag_sd_s, (fit.skew_ppm - 20.0) / fit.skew_sd_ppm])
+    assert HONEST[0] < rms(np.array(ratios)) < HONEST[1]
+
+
+def brisk(seed: int, smoothing_s: float) -> tuple[Record, float]:
+    """30 s of motion up to 6 Hz seen by a VPS that smooths by one pole; its delay of slow motion, s."""
+    rng = np.random.default_rng(seed)
+    interval_s = 1.0 / 400.0
+    t = np.arange(0.0, DURATION_S, interval_s)
+    phase = 2 * np.pi * rng.uniform(0.2, 6.0, (60, 1)) * t + rng.uniform(0, 2 * np.pi, (60, 1))
+    rate = 0.12 * np.sin(phase).T @ rng.normal(size=(60, 3))
+    q = propagate_stretches(t, rate, np.zeros(len(t), dtype=int))
+    kept = np.exp(-interval_s / smoothing_s)
+    smoothed = lfilter([1.0 - kept], [1.0, -kept], q, axis=0, zi=q[:1] * kept)[0]
+    noisy = rate[::2] + GOOD_GYRO_RADPS * rng.normal(size=(len(t[::2]), 3))
+    return (t[::2], noisy, t + 0.37, normalise(smoothed)), interval_s * kept / (1.0 - kept)
+
+
+@pytest.mark.parametrize("smoothing_s", [0.01, 0.04])
+def test_a_vps_that_smooths_has_no_one_lag(smoothing_s: float) -> None:
+    """Slow motion is later than fast motion: both are within the sd, to which noise adds little."""
+    for seed in range(3):
+        given, delay_s = brisk(seed, smoothing_s)
+        fit = by_rates.synchronise(*given)
+        error = abs(fit.lag_mid_s + 0.37 + delay_s)
+        assert error < 4.0 * fit.lag_sd_s
+        assert error > 4.0 * np.sqrt(fit.covariance[0, 0])
+        assert fit.lag_sd_s == pytest.approx(np.hypot(np.sqrt(fit.covariance[0, 0]), fit.spread[0]))
+
+
+def test_what_slower_motion_cannot_tell_adds_nothing(clean: Record) -> None:
+    """A VPS lost every 0.4 s has no stretch as long as a slow low-pass asks."""
+    t, rate, stamps, q = clean
+    seen = (stamps % 0.4) > 0.06
+    assert (by_rates.synchronise(t, rate, stamps[seen], q[seen]).spread == 0.0).all()
+    assert by_rates.synchronise(*clean).spread[0] < 0.1 * TENTH_MS
 
 
 def test_a_noisy_vps_does_not_pull_the_lag() -> None:

@@ -476,7 +476,8 @@ def test_covariance_is_that_of_lag_and_skew_among_twelve_coefficients() -> None:
     for channel in range(3):
         columns[:, channel, 2 + 4 * channel : 6 + 4 * channel] = x
     root = np.sqrt(weight)[:, None]
-    expected = least_squares_covariance(columns * root[:, :, None], residual * root)[1][:2, :2]
+    over = round(by_rates.STEADY_S / imu.interval_s)
+    expected = least_squares_covariance(columns * root[:, :, None], residual * root, steady_over=over)[1][:2, :2]
     sd = np.sqrt(np.diagonal(expected))
     np.testing.assert_allclose(fit.covariance / np.outer(sd, sd), expected / np.outer(sd, sd), atol=0.02)
 

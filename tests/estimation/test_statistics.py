@@ -88,6 +88,34 @@ def test_claimed_sd_of_a_line_in_coloured_noise_is_honest(correlation: float) ->
         assert rms(white_ratios) > 3.0  # what publishing the plain bound would mean
 
 
+def test_rest_says_nothing_of_the_errors_in_motion() -> None:
+    """A tenth of the record moves: there the slope is told, and there the noise is ten times that at rest."""
+    n, window = 2000, 100
+    moving = (np.arange(n) > 900) & (np.arange(n) < 1100)
+    s = np.where(moving, np.sin(np.arange(n) / 5.0), 0.0)
+    ratios, averaged = [], []
+    for seed in range(200):
+        noise = autoregressive(np.random.default_rng(seed), (n,), 0.5) * np.where(moving, 1.0, 0.1)
+        theta = s @ noise / (s @ s)
+        r = (noise - s * theta)[:, None]
+        for found, options in ((ratios, {"steady_over": window}), (averaged, {})):
+            _, coloured = statistics.least_squares_covariance(s[:, None, None], r, **options)
+            found.append(theta / np.sqrt(coloured[0, 0]))
+    assert HONEST[0] < rms(ratios) < HONEST[1]
+    assert rms(averaged) > 2.0
+
+
+def test_noise_of_one_size_is_the_same_over_any_window() -> None:
+    rng = np.random.default_rng(5)
+    s, size = rng.normal(size=(200, 2, 2)), rng.choice([-1.0, 1.0], size=(200, 2))
+    plain = statistics.least_squares_covariance(s, size)[1]
+    for window in (1, 7, 1000):
+        np.testing.assert_allclose(
+            statistics.least_squares_covariance(s, size, steady_over=window)[1], plain, rtol=1e-12
+        )
+    np.testing.assert_array_equal(statistics.least_squares_covariance(s, 0.0 * size, steady_over=7)[1], 0.0)
+
+
 def test_claimed_sd_under_huber_weights_is_honest() -> None:
     """A mean in contaminated noise by iterated weights: 500 seeds, covariance with the inflation it needs."""
     ratios = []

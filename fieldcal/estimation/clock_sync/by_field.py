@@ -61,6 +61,7 @@ def refine_by_field(
     Notes
     -----
     The lag contains the sensors' group delay, taken to be the same for both unless they contradict each other.
+    `spread` stays the gyroscope's: what the VPS's bandwidth does to one clock, it does to the other.
     """
     by_field = _clock(np.asarray(t, float), np.asarray(logged, float), np.asarray(t_vps, float), q_vps, fit, max_gap_s)
     if by_field is None or by_field.disagreement > AGREEMENT:
@@ -108,7 +109,8 @@ def _clock(
     _, covariance = least_squares_covariance(sensitivity, e, nuisance=3 * ELEMENTS)
     covariance = covariance * huber_inflation(weight)
     difference = np.array([lag - fit.lag_mid_s, skewed - 1e-6 * fit.skew_ppm])
-    disagreement = float(difference @ np.linalg.solve(covariance + fit.covariance, difference))
+    total = covariance + fit.covariance + np.diag(fit.spread**2)
+    disagreement = float(difference @ np.linalg.solve(total, difference))
     return FieldClock(lag, skewed, covariance, disagreement)
 
 

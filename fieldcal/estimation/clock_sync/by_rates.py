@@ -7,7 +7,7 @@ Fine: Gauss–Newton on the vector rates, ω_imu(t) ≈ M ω_vps(t) + c with the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,8 +33,12 @@ from fieldcal.geometry.rotation import (
 )
 from fieldcal.reason_codes import ReasonCode
 
-FINE_CUTOFF_HZ = 8.0
+FINE_CUTOFF_HZ, FINE_SIDE_S = 8.0, 0.5
+# The lag anew from slower motion alone: a VPS that smooths, or whose error goes with the motion, is not late by one
+# time at all frequencies. Length of that low-pass on either side, the rate that is enough after it, fewest rows.
+SLOWER_CUTOFF_HZ, SLOWER_SIDE_S, SLOWER_RATE_HZ, FEWEST_SLOWER = 2.0, 1.5, 40.0, 200
 REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock
+STEADY_S = 1.0  # over which the residual's size is taken for the same
 # Chance peaks of unrelated motions reach 0.9 in the coarse correlation; the vector fit tells them apart.
 MOST_GRID_PER_SAMPLE = 20  # a grid over hours of which minutes were recorded fills the memory with gaps
 MIN_EXPLAINED, MAX_SKEW_PPM, MAX_LAG_SD_S = 0.6, 2000.0, 0.01
@@ -63,7 +67,8 @@ class UniformRates:
 @dataclass(frozen=True)
 class SyncFit:
     """VPS clock + lag = IMU clock: `lag_mid_s` at mid-record, IMU time `reference_s`; `skew_ppm` > 0: VPS clock fast;
-    `covariance` (2, 2) of the lag at mid-record, s, and the skew (a ratio); `first_s` the first IMU sample.
+    `covariance` (2, 2) of the lag at mid-record, s, and the skew (a ratio), of noise alone; `spread` (2,) half of what
+    both differ from those by slower motion beyond chance, as an sd; `first_s` the first IMU sample.
 
     `explained` is the share of the rates' variance that the VPS accounts for; `peak` and `runner_up` are
     correlations (the second: best one outside the peak); `matrix` (3, 3) maps VPS body rates to logged rates, whose
@@ -80,6 +85,7 @@ class SyncFit:
     reference_s: float
     first_s: float
     turning: Array
+    spread: Array = field(default_factory=lambda: np.zeros(2))
 
     @property
     def lag_s(self) -> float:
@@ -89,12 +95,12 @@ class SyncFit:
     @property
     def lag_sd_s(self) -> float:
         """Standard deviation of the lag at mid-record, s."""
-        return float(np.sqrt(self.covariance[0, 0]))
+        return float(np.hypot(np.sqrt(self.covariance[0, 0]), self.spread[0]))
 
     @property
     def skew_sd_ppm(self) -> float:
         """Standard deviation of the skew, ppm."""
-        return float(1e6 * np.sqrt(self.covariance[1, 1]))
+        return float(1e6 * np.hypot(np.sqrt(self.covariance[1, 1]), self.spread[1]))
 
     def to_vps_clock(self, t_imu: ArrayLike) -> Array:
         """IMU stamps, s, on the VPS's clock."""
@@ -255,6 +261,7 @@ def synchronise(
     Notes
     -----
     The lag contains the difference of the two sensors' group delays. Both sides get the same zero-phase low-pass.
+    Half of what the lag by slower motion differs from it, beyond chance, is in its sd.
     """
     imu, vps = on_one_grid(t_imu, rate_imu, t_vps, q_vps, max_gap_s=max_gap_s)
     lag, peak, runner_up, width = correlate(imu, vps, max_lag_s, min_overlap_s=min_overlap_s)
@@ -338,13 +345,31 @@ def refined(
             " ms are needed: the motion is too slow, or too little of it is in both records.",
             measured,
         )
-    return fit
+    return replace(fit, spread=_spread(imu, vps, fit, measured))
 
 
-def _smoothed(s: UniformRates) -> UniformRates:
+def _spread(imu: UniformRates, vps: UniformRates, fit: SyncFit, measured: dict[str, float]) -> Array:
+    """Half of what lag, s, and skew (a ratio) by slower motion differ from the fit's, the chance of both taken off, as
+    an sd (2,); 0 where too little of the record is far enough from gaps to tell."""
+    own, other = (_thinned(_smoothed(r, SLOWER_CUTOFF_HZ, SLOWER_SIDE_S)) for r in (imu, vps))
+    if _both_valid(own, other, fit.to_vps_clock(own.t)).sum() < FEWEST_SLOWER:
+        return np.zeros(2)
+    slower = _refine(own, other, fit.lag_mid_s, fit.first_s, fit.reference_s, measured, skew=1e-6 * fit.skew_ppm)
+    difference = np.array([slower.lag_mid_s - fit.lag_mid_s, 1e-6 * (slower.skew_ppm - fit.skew_ppm)])
+    by_chance = np.diagonal(fit.covariance) + np.diagonal(slower.covariance)
+    return np.asarray(0.5 * np.sqrt(np.maximum(difference**2 - by_chance, 0.0)))
+
+
+def _thinned(s: UniformRates) -> UniformRates:
+    """Every so many of slow rates, SLOWER_RATE_HZ or more."""
+    every = max(1, int(1.0 / (SLOWER_RATE_HZ * s.interval_s)))
+    return UniformRates(s.start_s, every * s.interval_s, s.rate[::every], s.valid[::every])
+
+
+def _smoothed(s: UniformRates, cutoff_hz: float = FINE_CUTOFF_HZ, side_s: float = FINE_SIDE_S) -> UniformRates:
     """Low-passed rates; what the filter's main lobe mixes with a gap or an end is masked too."""
-    rate = low_pass(s.rate, FINE_CUTOFF_HZ, s.interval_s)
-    reach = round(0.5 / FINE_CUTOFF_HZ / s.interval_s)
+    rate = low_pass(s.rate, cutoff_hz, s.interval_s, side_s=side_s)
+    reach = round(0.5 / cutoff_hz / s.interval_s)
     bad = np.pad(~s.valid, reach, constant_values=True)
     total = np.concatenate([[0], np.cumsum(bad)])
     near = total[2 * reach + 1 :] - total[: len(s.valid)] > 0
@@ -370,9 +395,7 @@ def _refine(
     for _ in range(12):
         # t_vps = (t − middle)(1 + skew) + middle − lag
         at = (t - middle) * (1 + skew) + middle - lag
-        nearest = np.rint((at - vps.start_s) / vps.interval_s)
-        inside = (nearest >= 1) & (nearest < len(vps.rate) - 1) & imu.valid
-        inside[inside] = vps.valid[nearest[inside].astype(int)]
+        inside = _both_valid(imu, vps, at)
         w, w_dot = spline(at[inside]), slope(at[inside])
         x = np.column_stack([w, np.ones(len(w))])
         (affine, residual, xw), weight = _regressed(x, imu.rate[inside])
@@ -391,8 +414,11 @@ def _refine(
             break
     spread = imu.rate[inside] - np.average(imu.rate[inside], axis=0, weights=weight)
     explained = 1.0 - float(weight @ np.sum(residual**2, axis=1)) / float(weight @ np.sum(spread**2, axis=1))
-    # Both sides are filtered: the residual's colour sets the sd.
-    _, covariance = least_squares_covariance(sensitivity, residual * root[:, None])
+    # Both sides are filtered: the residual's colour sets the sd. What a VPS and a gyroscope get wrong grows with the
+    # motion, which alone tells the lag.
+    _, covariance = least_squares_covariance(
+        sensitivity, residual * root[:, None], steady_over=max(1, round(STEADY_S / imu.interval_s))
+    )
     return SyncFit(
         lag_mid_s=lag,
         skew_ppm=1e6 * skew,
@@ -406,6 +432,14 @@ def _refine(
         first_s=first,
         turning=np.cov(w.T),
     )
+
+
+def _both_valid(imu: UniformRates, vps: UniformRates, at: Array) -> np.ndarray:
+    """Which of the IMU's samples, at times `at` (n,) of the VPS's clock, are valid on both sides, (n,) bool."""
+    nearest = np.rint((at - vps.start_s) / vps.interval_s)
+    inside = (nearest >= 1) & (nearest < len(vps.rate) - 1) & imu.valid
+    inside[inside] = vps.valid[nearest[inside].astype(int)]
+    return np.asarray(inside)
 
 
 def _regressed(x: Array, y: Array) -> tuple[tuple[Array, Array, Array], Array]:

@@ -84,7 +84,7 @@ OTHER_PRIOR_SD = 1.0  # of all other parameters, each in its unit: rad of dip, m
 @dataclass(frozen=True)
 class Options:
     """What a fit is made with: a free `dip`, a free `lever_arm`, a VPS, a bound of the walk, `priors` by sensor,
-    and colour of the rows over seconds (`slow`)."""
+    colour of the rows over seconds (`slow`), and whether a lever arm that is found is doubted."""
 
     dip: bool = True
     lever_arm: bool = True
@@ -92,6 +92,7 @@ class Options:
     walk_ratio: float = LARGEST_WALK_RATIO
     priors: Mapping[str, PriorConstants] = field(default_factory=dict)
     slow: bool = False
+    doubt_lever_arm: bool = True
 
 
 @dataclass(frozen=True)
@@ -155,6 +156,7 @@ def fit_joint(
     levels: Levels | None = None,
     largest_walk_ratio: float = LARGEST_WALK_RATIO,
     priors: Mapping[str, PriorConstants] | None = None,
+    doubt_lever_arm: bool = True,
 ) -> JointFit:
     """Estimate all constants, attitudes and noise levels from a start within some tens of per cent.
 
@@ -178,6 +180,9 @@ def fit_joint(
         Most that the attitude's walk may be over that by the gyroscope's sample-to-sample noise.
     priors : mapping, optional
         Sensor → what is known of its constants before the first sample; of the others nearly nothing is.
+    doubt_lever_arm : bool
+        Put half of what a lever arm changes of the accelerometer's constants into their sd, which takes a second fit;
+        nothing else depends on it.
 
     Raises
     ------
@@ -195,7 +200,7 @@ def fit_joint(
     vehicle other than hard iron.
     """
     free = try_lever_arm and "accelerometer" in model.vectors
-    how = Options(free_dip, free, vps, largest_walk_ratio, priors or {})
+    how = Options(free_dip, free, vps, largest_walk_ratio, priors or {}, doubt_lever_arm=doubt_lever_arm)
     try:
         fit, response = _iterate(model, start, levels, 0, how)
     except EstimationError:
@@ -219,10 +224,11 @@ def fit_joint(
     if test >= LEVER_ARM_CHI2:  # the coloured covariance can only make it smaller
         fit = _enlarged(fit, response)
         test = _lever_arm_test(fit)
-    without = _enlarged(*_without_lever_arm(fit, response, how))
     if test < LEVER_ARM_CHI2:
-        return replace(without, lever_arm_test=test)
-    return replace(_or_without_arm(fit, without), lever_arm_test=test)
+        return replace(_enlarged(*_without_lever_arm(fit, response, how)), lever_arm_test=test)
+    if doubt_lever_arm:
+        fit = _or_without_arm(fit, _without_lever_arm(fit, response, how)[0])
+    return replace(fit, lever_arm_test=test)
 
 
 def _is_slow(fit: JointFit) -> bool:

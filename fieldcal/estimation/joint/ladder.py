@@ -41,6 +41,7 @@ def fit_with_fallbacks(
     priors: Mapping[str, PriorConstants],
     *,
     lever_arm: Array | None = None,
+    doubt_lever_arm: bool = True,
 ) -> Outcome:
     """The joint estimate on the first rung that has a minimum.
 
@@ -57,6 +58,8 @@ def fit_with_fallbacks(
         Sensor → what is known of it beforehand; of counts nothing is, and only `free` can be tried.
     lever_arm : (3,) array, optional
         As measured on the vehicle, sensor axes.
+    doubt_lever_arm : bool
+        As of `fit_joint`.
 
     Raises
     ------
@@ -95,7 +98,7 @@ def fit_with_fallbacks(
                 prepared = initialise.prepare(readings, own_start, lever_arm=lever_arm)
             model, state = prepared
             free_arm = lever_arm is None and not level and rung in (Rung.FREE, Rung.INERTIAL_START)
-            fit = fit_joint(model, state, try_lever_arm=free_arm, priors=own_priors)
+            fit = fit_joint(model, state, try_lever_arm=free_arm, priors=own_priors, doubt_lever_arm=doubt_lever_arm)
         except (UnusableFlight, EstimationError) as error:
             failed[rung] = str(error)
             first = first or error

@@ -119,6 +119,7 @@ def _refitted(
         levels=levels,
         largest_walk_ratio=like.options.walk_ratio,
         priors=like.priors,
+        doubt_lever_arm=like.options.doubt_lever_arm,
     )
 
 
@@ -161,6 +162,8 @@ def _scores(fit: JointFit) -> tuple[dict[str, float], dict[str, dict[str, Array]
 def _gains(fit: JointFit, names: list[str]) -> dict[str, float]:
     """Forward selection on the first part of the record, tested on the rest: gain over its sd of each term, beside the
     terms accepted before it."""
+    # Predictions ask for no sd.
+    fit = replace(fit, options=replace(fit.options, doubt_lever_arm=False))
     n = len(fit.model.readings.t)
     split = int(fit.model.knots.index[np.searchsorted(fit.model.knots.index, int(FIT_SHARE * n))])
     early, late = (_part(fit, a, b) for a, b in ((0, split + 1), (split, n)))

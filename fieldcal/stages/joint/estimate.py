@@ -219,7 +219,9 @@ def _held_out(
             start: dict[str, tuple[Array, Array] | None] = {
                 name: fit.constants(name)[:2] for name in SENSORS if name in fit.layout
             }
-            early = fit_with_fallbacks(part, start, fit.priors, lever_arm=_lever_arm(s)).fit
+            # The accelerometer's sd, all that doubt of its arm is in, is not asked of this part.
+            outcome = fit_with_fallbacks(part, start, fit.priors, lever_arm=_lever_arm(s), doubt_lever_arm=False)
+            early = outcome.fit
         kept = [name for name in TERMS if name in fit.layout]
         early = model_selection.with_terms(early, kept) if kept else early
     except (UnusableFlight, EstimationError):

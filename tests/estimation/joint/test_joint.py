@@ -175,6 +175,19 @@ def test_claimed_standard_deviations_are_honest(moving: list[tuple[SimulatedFlig
     assert low < np.mean([np.mean(normalised_errors(r, fit) ** 2) for r, fit in moving]) < high
 
 
+def test_doubt_of_a_lever_arm_is_in_the_accelerometers_sd_alone(moving: list[tuple[SimulatedFlight, JointFit]]) -> None:
+    r, doubted = moving[0]
+    given = readings(r)
+    fit = fit_joint(*initialise.prepare(given, own_start(given, r.experiment)), doubt_lever_arm=False)
+    assert fit.lever_arm_test == doubted.lever_arm_test
+    for name, value in doubted.state.values.items():
+        np.testing.assert_array_equal(fit.state.values[name], value)
+    more, own = doubted.covariance - fit.covariance, fit.layout["accelerometer"]
+    assert (np.diagonal(more)[own] > 0.0).all()
+    more[own, own] = 0.0
+    assert not more.any()
+
+
 def test_clean_flights_keep_no_lever_arm_and_honest_sd() -> None:
     nees = []
     for seed in SEEDS[:4]:
