@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from fieldcal.config.stage_settings import CompositionSettings
 
 COMPOSED = ("scale", "bias", "zero", "zero_bias")
+ORIGIN = "origin"
+"""Among what the stage measured: where its readings come from."""
 SQUARE = 1e-9
 """Off-diagonal share of a matrix that is rounding."""
 
@@ -51,8 +54,19 @@ def compose(tables: Tables, s: CompositionSettings) -> StageResult:
             out.append(of_raw if is_known[sensor] else _not_known(of_raw))
             residual = of_method.filter(pl.col("parameter").is_in([*COMPOSED, ZERO_SLOPE]))
             out.append(residual.with_columns(parameter=pl.lit(RESIDUAL) + pl.col("parameter")))
-    measured: dict[str, Json] = {"composed": composed} if composed else {}
+    measured: dict[str, Json] = {ORIGIN: _origin(s), **({"composed": composed} if composed else {})}
     return StageResult({"calibration": pl.concat(out)}, measured=measured)
+
+
+def _origin(s: CompositionSettings) -> dict[str, Json]:
+    """What an export has to know of the readings: their axes and signs, and what an autopilot had loaded for them."""
+    loaded = {str(sensor): asdict(own) for sensor in s.own_sensors if (own := s.loaded[sensor]) is not None}
+    return {
+        "body": s.body,
+        "gravity_sign": s.gravity_sign,
+        "rotation_body_from_sensor": s.rotation_body_from_sensor,
+        "loaded": loaded,
+    }
 
 
 def _not_known(rows: pl.DataFrame) -> pl.DataFrame:

@@ -40,6 +40,10 @@ def settings(matrix: np.ndarray, offset: np.ndarray, *, known: bool = True) -> C
         applied_matrix_sd={**own, Sensor.GYROSCOPE: 0.0},
         applied_offset_sd={**own, Sensor.GYROSCOPE: (0.0, 0.0, 0.0)},
         own_sensors=SENSORS,
+        body="frd",
+        gravity_sign="specific_force",
+        rotation_body_from_sensor=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        loaded=dict.fromkeys(SENSORS),
     )
 
 
