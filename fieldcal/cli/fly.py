@@ -11,7 +11,7 @@ import fieldcal
 from fieldcal.cli.options import AsJson, Config, Output, Root, UnusedConfig
 from fieldcal.reason_codes import ReasonCode
 
-Format = Literal["px4", "ardupilot", "ros", "kalibr", "json", "c"]
+Format = Literal["px4", "ardupilot", "ros", "imu_calib", "imu_pipeline", "kalibr", "json", "c"]
 """The names in `exports.FORMATS`, which itself would make every `--help` slow."""
 
 
@@ -22,6 +22,9 @@ def export(
     to: Annotated[Format, Parameter(name=["--format", "-f"])] = "json",
     at_temperature: float | None = None,
     unit: str | None = None,
+    params: Path | None = None,
+    logged_raw: bool = False,
+    system_id: int = 1,
     output: Output = None,
     warehouse: Root = None,
     config: UnusedConfig = None,
@@ -33,18 +36,29 @@ def export(
     vehicle
         The vehicle that flies; the constants are those of the primary units that flew last on it.
     to
-        PX4 or ArduPilot parameters, ROS 2 or Kalibr YAML, JSON, a C header.
+        PX4 or ArduPilot parameters, ROS 2 or Kalibr YAML, files of ROS packages, JSON, a C header.
     at_temperature
         °C; 25 unless given. Slopes on temperature go along where the target has a place for them.
     unit
         Another unit on board, by its unit_id (fieldcal history --json tells them).
+    params
+        PX4, ArduPilot: the autopilot's parameters while the logs were recorded, as QGroundControl, Mission Planner or
+        MAVProxy saves them; else those in the logs.
+    logged_raw
+        PX4, ArduPilot: states that nothing had corrected the readings before they were logged.
+    system_id
+        PX4: MAVLink's, of the vehicle.
     output
         File to write; else stdout.
     """
+    if to not in ("px4", "ardupilot") and (params is not None or logged_raw):
+        told = f"--params and --logged-raw are for px4 and ardupilot; {to} takes the constants as they are."
+        raise fieldcal.FieldcalError(ReasonCode.WRONG_OPTION, told)
     from fieldcal.warehouse.files import write_bytes
     from fieldcal.words.talk import say
 
-    result = fieldcal.export(fieldcal.Warehouse(warehouse).calibration_at(vehicle, at_temperature, unit=unit), to)
+    constants = fieldcal.Warehouse(warehouse).calibration_at(vehicle, at_temperature, unit=unit)
+    result = fieldcal.export(constants, to, parameters=params, logged_raw=logged_raw, system_id=system_id)
     for warning in result.warnings:
         say(warning)
     if output is None:

@@ -28,6 +28,7 @@ USAGE_CODES = (
     ReasonCode.NOT_FOUND,
     ReasonCode.NO_ARCHIVE,
     ReasonCode.NO_SESSION,
+    ReasonCode.NOT_LOADABLE,
     ReasonCode.SQL_REFUSED,
     ReasonCode.SQL_WRONG,
     ReasonCode.WRONG_OPTION,
