@@ -86,8 +86,8 @@ def apply(
     log
         A log: MCAP, ROS bag (file or folder), PX4 ULog, ArduPilot .bin or CSV, or a folder with imu.csv.
     output
-        NAME.mcap: ROS 2 Imu and MagneticField in body axes (REP-103). Anything else: a folder for imu.parquet and
-        magnetometer.parquet, in the sensor axes as logged.
+        NAME.mcap: ROS 2 Imu and MagneticField in body axes (REP-103). NAME.csv, NAME.parquet: one table, in the sensor
+        axes as logged. A name without an ending: a folder for imu.parquet and magnetometer.parquet.
     vehicle
         The vehicle; else the folder two levels above the log.
     at_temperature

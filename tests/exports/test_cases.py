@@ -1,7 +1,7 @@
 """Logs that came out wrong on the aircraft: corrected ones, and ones in other axes and signs than an autopilot's.
 
 They are the cases `autopilot-corrected`, `body-flu` and `gravity-sign-rotated` of the folder `cases/calibration`. Truth
-is in the sensor's axes, forward, right, down, at 25 °C: z = scale (raw − zero); that of the accelerometer in the sign of
+is in axes forward, right, down of the sensor, at 25 °C: z = scale (raw − zero); the accelerometer's in the sign of
 its log."""
 
 from __future__ import annotations
