@@ -53,8 +53,8 @@ def write_calibrated(c: CalibratedReadings, place: Path) -> tuple[list[Path], tu
     if ending not in (".csv", ".parquet"):
         raise FieldcalError(
             ReasonCode.WRONG_OPTION,
-            f"{place.name}: calibrated readings are written as .mcap, .csv or .parquet, or into a folder: a name without an"
-            " ending.",
+            f"{place.name}: calibrated readings are written as .mcap, .csv or .parquet, or into a folder, named without"
+            " an ending.",
         )
     make_folder(place.absolute().parent)
     if ending == ".csv":
