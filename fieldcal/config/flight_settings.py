@@ -38,7 +38,8 @@ class FlightSettings:
     nominal_scale : |scale| from logged to calibrated unit, None where nobody knows it (counts)
     reference_reading : d0 of `zero_bias`, None leaves it to the readings
     applied_matrix, applied_offset : what an autopilot had made of raw readings before it logged them (`logs.applied`),
-        whether that is known whole, and how far it changed within the flight; None where they are raw
+        whether that is known whole, how far it changed within the flight, and how the offset follows the temperature;
+        None where they are raw
     loaded : what an autopilot had loaded for a sensor, None where no autopilot wrote the log
     own_sensors : those of the unit that is calibrated; the others only help
     """
@@ -63,6 +64,7 @@ class FlightSettings:
     applied_known: Mapping[Sensor, bool | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
     applied_matrix_sd: Mapping[Sensor, float | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
     applied_offset_sd: Mapping[Sensor, Triple | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
+    applied_offset_per_degc: Mapping[Sensor, Triple | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
     loaded: Mapping[Sensor, Loaded | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
     own_sensors: tuple[Sensor, ...] = SENSORS
 

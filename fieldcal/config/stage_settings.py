@@ -318,6 +318,7 @@ class CompositionSettings(Axes):
     applied_known: Mapping[Sensor, bool | None]
     applied_matrix_sd: Mapping[Sensor, float | None]
     applied_offset_sd: Mapping[Sensor, Triple | None]
+    applied_offset_per_degc: Mapping[Sensor, Triple | None]
     gravity_sign: str
     loaded: Mapping[Sensor, Loaded | None]
     own_sensors: tuple[Sensor, ...]

@@ -291,6 +291,7 @@ def settings_of(facts: Facts, vehicle: Vehicle, unit: str = PRIMARY) -> FlightSe
         applied_known={s: known[s]["known"] if s in known else None for s in SENSORS},
         applied_matrix_sd={s: known[s]["matrix_sd"] if s in known else None for s in SENSORS},
         applied_offset_sd={s: _triple(known[s]["offset_sd"]) if s in known else None for s in SENSORS},
+        applied_offset_per_degc={s: _triple(known[s]["offset_per_degc"]) if s in known else None for s in SENSORS},
         loaded={s: _loaded(on_board, s) for s in SENSORS},
     )
 

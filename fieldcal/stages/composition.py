@@ -48,9 +48,10 @@ def compose(tables: Tables, s: CompositionSettings) -> StageResult:
             out.append(own)  # by nothing but its mounting
             continue
         composed.append(str(sensor))
+        slope = np.array(s.applied_offset_per_degc[sensor] or (0.0, 0.0, 0.0))
         uncertain = matrix_sd[sensor] or 0.0, np.array(offset_sd[sensor] or (0.0, 0.0, 0.0))
         for _, of_method in own.group_by("method", maintain_order=True):
-            of_raw = _of_raw(of_method, np.array(matrix), np.array(offset), *uncertain)
+            of_raw = _of_raw(of_method, np.array(matrix), np.array(offset), slope, *uncertain)
             out.append(of_raw if is_known[sensor] else _not_known(of_raw))
             residual = of_method.filter(pl.col("parameter").is_in([*COMPOSED, ZERO_SLOPE]))
             out.append(residual.with_columns(parameter=pl.lit(RESIDUAL) + pl.col("parameter")))
@@ -88,7 +89,7 @@ def in_log(rows: pl.DataFrame) -> pl.DataFrame:
     return rows.filter(~of_raw).with_columns(parameter=pl.col("parameter").str.strip_prefix(RESIDUAL))
 
 
-def _of_raw(rows: pl.DataFrame, p: Array, o: Array, p_sd: float, o_sd: Array) -> pl.DataFrame:
+def _of_raw(rows: pl.DataFrame, p: Array, o: Array, o_per_degc: Array, p_sd: float, o_sd: Array) -> pl.DataFrame:
     """One sensor's rows of one method. Scale and zero hardly depend on each other, and stand for the rest."""
     found = {(row["parameter"], row["axis"]): row for row in cast(list[CalibrationRow], rows.to_dicts())}
     inverse = np.linalg.inv(p)
@@ -96,7 +97,7 @@ def _of_raw(rows: pl.DataFrame, p: Array, o: Array, p_sd: float, o_sd: Array) ->
     if ZERO_SLOPE in {parameter for parameter, _ in found}:
         own = [found[ZERO_SLOPE, axis] for axis in AXES]
         slope, slope_sd = _numbers(own)
-        others += _with(own, _through(inverse, slope), np.sqrt(_through(inverse**2, slope_sd**2)))
+        others += _with(own, _through(inverse, slope - o_per_degc), np.sqrt(_through(inverse**2, slope_sd**2)))
     if ("scale", "x") not in found or ("zero", "x") not in found:
         return calibration_rows(others)
     full = ("scale", "xy") in found or np.any(np.abs(p - np.diag(np.diagonal(p))) > SQUARE)

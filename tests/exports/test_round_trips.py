@@ -173,6 +173,7 @@ def composed(case: Case, found: dict[Sensor, tuple[np.ndarray, np.ndarray]]) -> 
         applied_known=dict.fromkeys(SENSORS, True),
         applied_matrix_sd=dict.fromkeys(SENSORS, 0.0),
         applied_offset_sd=dict.fromkeys(SENSORS, (0.0, 0.0, 0.0)),
+        applied_offset_per_degc=dict.fromkeys(SENSORS),
         gravity_sign="specific_force",
         body="frd",
         rotation_body_from_sensor=NOT_TURNED,
