@@ -7,7 +7,9 @@ in rad/s, m/s² and gauss; what is left out of a file has its default.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +41,8 @@ def read_mission_planner(text: str, folder: Path) -> dict[str, float]:
     path = folder / "exported.param"
     path.write_text(text)
     loaded = MAVParmDict()
-    assert loaded.load(str(path))
+    with redirect_stdout(io.StringIO()):
+        assert loaded.load(str(path))
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     assert len(loaded) == len(lines)
     return {name: float(np.float32(value)) for name, value in loaded.items()}

@@ -9,6 +9,7 @@ from fieldcal.api.calibration import Calibration
 from fieldcal.api.recording import Recording, as_recording
 from fieldcal.exports import AUTOPILOTS, FORMATS, export_to
 from fieldcal.exports.apply import CalibratedReadings, apply_constants
+from fieldcal.exports.autopilots.comparison import Compared, compared
 from fieldcal.exports.autopilots.loading import Request
 from fieldcal.exports.autopilots.parameter_file import read_parameters
 from fieldcal.exports.calibration import Constants, Export
@@ -71,6 +72,46 @@ def export(
     told = read_parameters(Path(parameters)) if isinstance(parameters, Path | str) else parameters
     own = constants.constants() if isinstance(constants, Calibration) else constants
     return export_to(to, own, Request(told, logged_raw, system_id))
+
+
+def compare(
+    constants: Constants | Calibration,
+    *,
+    parameters: Mapping[str, float] | Path | str | None = None,
+    logged_raw: bool = False,
+) -> list[Compared]:
+    """What a vehicle's autopilot flies with beside its constants, axis by axis, and what the difference does.
+
+    Parameters
+    ----------
+    constants : Constants or Calibration
+        `Warehouse.calibration_at`, or one flight's own.
+    parameters, logged_raw : optional
+        As in `export`; without `parameters` those in the log of an autopilot.
+
+    Returns
+    -------
+    list of Compared
+
+    Raises
+    ------
+    FieldcalError
+        `not_loadable`: what it flies with is not known; `not_found`, `wrong_option`: the file of parameters.
+    Refused
+        The calibration has no sensor that was not refused.
+
+    Examples
+    --------
+    >>> import fieldcal
+    >>> try:
+    ...     fieldcal.compare(fieldcal.Constants("quad-1", "quad-1", {}, ""))
+    ... except fieldcal.FieldcalError as error:
+    ...     print(error.reason_code)
+    not_loadable
+    """
+    told = read_parameters(Path(parameters)) if isinstance(parameters, Path | str) else parameters
+    own = constants.constants() if isinstance(constants, Calibration) else constants
+    return compared(own, Request(told, logged_raw))[0]
 
 
 def apply(

@@ -68,6 +68,44 @@ def export(
     return 0
 
 
+def compare(
+    vehicle: str,
+    /,
+    *,
+    params: Path | None = None,
+    logged_raw: bool = False,
+    at_temperature: float | None = None,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: UnusedConfig = None,
+) -> int:
+    """What a vehicle's autopilot flies with beside what the history says, and whether it matters. Nothing is written.
+
+    Parameters
+    ----------
+    vehicle
+        The vehicle that flies: the units that were on board last.
+    params
+        What is loaded, as QGroundControl, Mission Planner or MAVProxy saves it; else the parameters in the last log.
+    logged_raw
+        States that nothing had corrected the readings of other logs than an autopilot's.
+    at_temperature
+        °C; 25 unless given.
+    """
+    from dataclasses import asdict
+
+    from fieldcal.cli.show import console, print_json, table
+    from fieldcal.exports.autopilots.comparison import COLUMNS, lines
+
+    constants = fieldcal.Warehouse(warehouse).calibration_at(vehicle, at_temperature)
+    rows = fieldcal.compare(constants, parameters=params, logged_raw=logged_raw)
+    if as_json:
+        print_json([{**asdict(row), "sd": row.sd if row.sd == row.sd else None} for row in rows])
+    else:
+        console().print(table(COLUMNS, lines(rows), title=f"{vehicle}: what it flies with, and what is estimated"))
+    return 0
+
+
 def apply(
     log: Path,
     /,

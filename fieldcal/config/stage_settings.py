@@ -310,7 +310,7 @@ class ChoiceSettings(Axes, NominalScale):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompositionSettings(Axes):
+class CompositionSettings(Axes, LocalField):
     """Stage `composition`."""
 
     applied_matrix: Mapping[Sensor, Rotation | None]

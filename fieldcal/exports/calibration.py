@@ -132,6 +132,8 @@ class Origin:
     rotation_body_from_sensor : rows of a (3, 3) matrix
     temperature_degc : float or None
         Of the flight, °C: that of a zero whose slope is not known.
+    horizontal_field_g : float or None
+        North and east of the local field, gauss; None where its strength is not known.
 
     Examples
     --------
@@ -144,6 +146,7 @@ class Origin:
     gravity_sign: str = "specific_force"
     rotation_body_from_sensor: Rotation = NOT_TURNED
     temperature_degc: float | None = None
+    horizontal_field_g: float | None = None
 
 
 @dataclass(frozen=True)

@@ -47,8 +47,8 @@ class _Axis(TypedDict):
     slope_per_degc_sd: float | None
     curve_per_degc2: float | None
     curve_per_degc3: float | None
-    temperature_min_degc: float
-    temperature_max_degc: float
+    temperature_min_degc: float | None
+    temperature_max_degc: float | None
 
 
 _Number = Literal["value", "sd", "slope_per_degc", "curve_per_degc2", "curve_per_degc3"]
@@ -135,12 +135,14 @@ def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
     # The curve about 25 °C, brought to the temperature that is asked for.
     first, second, third = (vector("zero", c) for c in _CURVE)
     slope, square, cube = cubic_about(first, second, third, at - REFERENCE_DEGC)
-    sloped = [row for row in found.values() if row["slope_per_degc"] is not None]
-    flown = (
-        (max(r["temperature_min_degc"] for r in sloped), min(r["temperature_max_degc"] for r in sloped))
-        if sloped
-        else None
-    )
+    spans = [
+        (low, high)
+        for row in found.values()
+        if row["slope_per_degc"] is not None
+        and (low := row["temperature_min_degc"]) is not None
+        and (high := row["temperature_max_degc"]) is not None
+    ]
+    flown = (max(low for low, _ in spans), min(high for _, high in spans)) if spans else None
     return Triad(
         scale=matrix("value"),
         zero=vector("zero", "value"),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import polars as pl
 
+from fieldcal.geometry.earth_field import UNIT_IN_TESLA
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import RESIDUAL, SENSORS, Json, Status
 from fieldcal.reason_codes import ReasonCode
@@ -66,8 +67,15 @@ def _origin(s: CompositionSettings) -> dict[str, Json]:
         "body": s.body,
         "gravity_sign": s.gravity_sign,
         "rotation_body_from_sensor": s.rotation_body_from_sensor,
+        "horizontal_field_g": _horizontal_field_g(s),
         "loaded": loaded,
     }
+
+
+def _horizontal_field_g(s: CompositionSettings) -> float | None:
+    """By what a compass points; None where the field's strength is not known."""
+    tesla = UNIT_IN_TESLA.get(s.field_unit)
+    return None if tesla is None else float(np.hypot(*s.field_ned[:2])) * tesla / UNIT_IN_TESLA["G"]
 
 
 def _not_known(rows: pl.DataFrame) -> pl.DataFrame:

@@ -175,6 +175,8 @@ def composed(case: Case, found: dict[Sensor, tuple[np.ndarray, np.ndarray]]) -> 
         applied_offset_sd=dict.fromkeys(SENSORS, (0.0, 0.0, 0.0)),
         applied_offset_per_degc=dict.fromkeys(SENSORS),
         gravity_sign="specific_force",
+        field_ned=(0.2, 0.0, 0.45),
+        field_unit="G",
         body="frd",
         rotation_body_from_sensor=NOT_TURNED,
         loaded=dict.fromkeys(SENSORS),

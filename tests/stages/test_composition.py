@@ -44,6 +44,8 @@ def settings(matrix: np.ndarray, offset: np.ndarray, *, known: bool = True) -> C
         body="frd",
         applied_offset_per_degc=dict.fromkeys(SENSORS),
         gravity_sign="specific_force",
+        field_ned=(0.2, 0.0, 0.45),
+        field_unit="G",
         rotation_body_from_sensor=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
         loaded=dict.fromkeys(SENSORS),
     )

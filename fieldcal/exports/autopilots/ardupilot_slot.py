@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -61,6 +62,15 @@ class ArduPilot:
     def names_device(self, sensor: Sensor) -> str:
         """How the parameter with a slot's device id is called."""
         return "COMPASS_DEV_IDn" if sensor == Sensor.MAGNETOMETER else f"INS_{KIND[sensor]}n_ID"
+
+    def parameter(self, sensor: Sensor, slot: int, what: Literal["zero", "scale"], axis: int) -> str | None:
+        """The parameter that holds a sensor's constant; None where there is none."""
+        if sensor == Sensor.MAGNETOMETER:
+            compass = compass_names(slot)
+            return (compass.offset if what == "zero" else compass.diagonal)[axis]
+        names = inertial_names(KIND[sensor], slot)
+        own = names.offset if what == "zero" else names.scale
+        return None if own is None else own[axis]
 
     def raw(self, triad: Triad, sensor: Sensor, slot: int, parameters: Mapping[str, float]) -> Triad:
         """Constants of the raw sensor in its own axes, of a compass in the body's, from those of readings in body axes

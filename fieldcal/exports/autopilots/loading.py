@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -47,6 +47,7 @@ class Loadable:
     """Constants of a raw sensor in the axes and units in which its autopilot calibrates.
 
     `slot` from 0. `device_id`: None where it is not known. `parameters`: what is loaded; empty where that is not known.
+    `unit_id`, `horizontal_field_g`: whose they are, and where they come from (`Origin`).
     """
 
     sensor: Sensor
@@ -54,6 +55,8 @@ class Loadable:
     slot: int
     device_id: int | None
     parameters: Mapping[str, float] = field(default_factory=dict)
+    unit_id: str = ""
+    horizontal_field_g: float | None = None
 
 
 class Slots(Protocol):
@@ -87,6 +90,9 @@ class Slots(Protocol):
     def names_device(self, sensor: Sensor) -> str:
         """How the parameter with a slot's device id is called."""
 
+    def parameter(self, sensor: Sensor, slot: int, what: Literal["zero", "scale"], axis: int) -> str | None:
+        """The parameter that holds a sensor's constant; None where there is none."""
+
     def raw(self, triad: Triad, sensor: Sensor, slot: int, parameters: Mapping[str, float]) -> Triad:
         """Constants of the raw sensor in its own axes, from those of readings in body axes that had been corrected."""
 
@@ -119,7 +125,9 @@ def loadable(constants: Constants, target: Slots, request: Request) -> tuple[lis
                     f"{sensor}{_of_unit(own, sensor, constants)}: left out. Its slot has another unit's already."
                 )
                 continue
-            found.append(one)
+            origin = own.origins.get(sensor) or Origin()
+            unit_id = own.unit_ids.get(sensor, "")
+            found.append(replace(one, unit_id=unit_id, horizontal_field_g=origin.horizontal_field_g))
             told += more
     if not found:
         raise FieldcalError(ReasonCode.NOT_LOADABLE, f"Nothing to load into {target.title}. {' '.join(told)}")

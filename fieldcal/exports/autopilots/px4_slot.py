@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -43,6 +44,12 @@ class Px4:
     def names_device(self, sensor: Sensor) -> str:
         """How the parameter with a slot's device id is called."""
         return f"{CALIBRATION[sensor]}n_ID"
+
+    def parameter(self, sensor: Sensor, slot: int, what: Literal["zero", "scale"], axis: int) -> str | None:
+        """The parameter that holds a sensor's constant; None where there is none."""
+        if (sensor, what) == (Sensor.GYROSCOPE, "scale"):
+            return None
+        return f"{CALIBRATION[sensor]}{slot}_{'XYZ'[axis]}{'OFF' if what == 'zero' else 'SCALE'}"
 
     def raw(self, triad: Triad, sensor: Sensor, slot: int, parameters: Mapping[str, float]) -> Triad:
         """Constants of the raw sensor in its own axes, from those of readings in body axes that PX4 had corrected."""
