@@ -114,7 +114,7 @@ def test_the_table_has_a_cell_a_column() -> None:
         "0",
         "0.0100 ± 0.0010",
         "0.01",
-        "34 ° in 60 s",
+        "34.4 ° in 60 s",
         "CAL_GYRO0_XOFF",
         "yes",
     ]

@@ -159,6 +159,19 @@ def test_without_a_device_id_the_only_slot_is_taken_or_none() -> None:
     np.testing.assert_allclose(of(p, "CAL_GYRO2_", "OFF"), ZERO[Sensor.GYROSCOPE])
 
 
+def test_older_ardupilot_has_no_device_ids() -> None:
+    """A log tells of each unit the parameters of its own slot."""
+    loaded = {f"INS_GYR2OFFS_{axis}": 0.01 for axis in "XYZ"}
+    own = constants(flown("ardupilot", None, loaded), Sensor.GYROSCOPE)
+    export = AUTOPILOTS["ardupilot"](own, None)
+    assert "INS_GYR2OFFS_X,0.02" in export.text
+    assert "_ID" not in export.text
+    assert any(told.startswith("INS_GYRn_ID stay as they are") for told in export.warnings)
+    both = {**loaded, **{f"INS_GYROFFS_{axis}": 0.01 for axis in "XYZ"}}
+    with pytest.raises(FieldcalError, match="there is not one device"):
+        AUTOPILOTS["ardupilot"](constants(flown("ardupilot", None, both), Sensor.GYROSCOPE), None)
+
+
 def test_parameters_that_are_given_are_what_is_loaded_now() -> None:
     """The log's own tell how the raw sensor is mounted; its slot may be another one since."""
     own = constants(flown("px4", 9, {"CAL_GYRO0_ID": 9.0}), Sensor.GYROSCOPE)

@@ -59,6 +59,10 @@ class ArduPilot:
         ids = {slot: parameters.get(one.device_id, 0.0) for slot, one in _names(sensor).items()}
         return {slot: int(number) for slot, number in ids.items() if number}
 
+    def named(self, sensor: Sensor, parameters: Mapping[str, float]) -> list[int]:
+        """Slots that have an offset: older firmware has no device ids."""
+        return [slot for slot, one in _names(sensor).items() if one.offset[0] in parameters]
+
     def names_device(self, sensor: Sensor) -> str:
         """How the parameter with a slot's device id is called."""
         return "COMPASS_DEV_IDn" if sensor == Sensor.MAGNETOMETER else f"INS_{KIND[sensor]}n_ID"

@@ -35,6 +35,7 @@ MATTERS = {"° in 60 s": 5.0, "° a turn": 3.0, "mg": 5.0, "° of heading": 1.0}
 of course."""
 SURE_SD = 2.0
 """And from so many standard deviations on."""
+ROUNDING = 1e-9
 COLUMNS = ("sensor", "axis", "of", "flies with", "estimate", "difference", "which is", "parameter", "matters")
 
 
@@ -109,13 +110,18 @@ def lines(rows: Sequence[Compared]) -> list[list[str]]:
             f"{row.parameter}, {row.unit}" if row.unit else row.parameter,
             number(row.flies_with),
             with_sd(row.estimate, row.sd if np.isfinite(row.sd) else None),
-            number(row.estimate - row.flies_with, 3),
-            "–" if row.effect is None else f"{number(row.effect, 2)} {row.effect_unit}",
+            number(_shown(row.estimate - row.flies_with), 3),
+            "–" if row.effect is None else f"{number(_shown(row.effect), 3)} {row.effect_unit}",
             row.name or "none",
             "yes" if row.matters else "no",
         ]
         for row in rows
     ]
+
+
+def _shown(value: float) -> float:
+    """Without what is rounding only."""
+    return 0.0 if abs(value) < ROUNDING else value
 
 
 def _autopilot(constants: Constants, request: Request) -> str:

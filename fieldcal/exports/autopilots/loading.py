@@ -87,6 +87,9 @@ class Slots(Protocol):
     def devices(self, sensor: Sensor, parameters: Mapping[str, float]) -> dict[int, int]:
         """Slot → device id, of slots that have one."""
 
+    def named(self, sensor: Sensor, parameters: Mapping[str, float]) -> list[int]:
+        """Slots that parameters tell of, with a device id or without, as of firmware that has none."""
+
     def names_device(self, sensor: Sensor) -> str:
         """How the parameter with a slot's device id is called."""
 
@@ -230,6 +233,9 @@ def _slot(
                 f"No {named} is its device id, {device_id} (there is: {there}): let {target.title} calibrate it once."
             )
         return slot, device_id
+    named_slots = target.named(sensor, parameters)
+    if not known and len(named_slots) == 1:
+        return named_slots[0], None
     if len(known) != 1:
         there = ", ".join(map(str, known.values())) or "none"
         raise _LeftOut(

@@ -41,6 +41,10 @@ class Px4:
         ids = {slot: parameters.get(f"{CALIBRATION[sensor]}{slot}_ID", 0.0) for slot in range(SLOTS)}
         return {slot: int(number) for slot, number in ids.items() if number}
 
+    def named(self, sensor: Sensor, parameters: Mapping[str, float]) -> list[int]:
+        """None: PX4 uses no slot without a device id."""
+        return []
+
     def names_device(self, sensor: Sensor) -> str:
         """How the parameter with a slot's device id is called."""
         return f"{CALIBRATION[sensor]}n_ID"
