@@ -38,7 +38,7 @@ def compose(tables: Tables, s: CompositionSettings) -> StageResult:
         )
     rows = pl.concat(parts).filter(pl.col("sensor").is_in(s.own_sensors))
     of_matrix, of_offset, is_known = s.applied_matrix, s.applied_offset, s.applied_known
-    matrix_sd, offset_sd = s.applied_matrix_sd, s.applied_offset_sd
+    matrix_sd, offset_sd, per_degc = s.applied_matrix_sd, s.applied_offset_sd, s.applied_offset_per_degc
     out = [rows.filter(~pl.col("sensor").is_in([name for name in SENSORS if of_matrix[name] is not None]))]
     composed: list[str] = []
     for sensor in SENSORS:
@@ -49,7 +49,7 @@ def compose(tables: Tables, s: CompositionSettings) -> StageResult:
             out.append(own)  # by nothing but its mounting
             continue
         composed.append(str(sensor))
-        slope = np.array(s.applied_offset_per_degc[sensor] or (0.0, 0.0, 0.0))
+        slope = np.array(per_degc[sensor] or (0.0, 0.0, 0.0))
         uncertain = matrix_sd[sensor] or 0.0, np.array(offset_sd[sensor] or (0.0, 0.0, 0.0))
         for _, of_method in own.group_by("method", maintain_order=True):
             of_raw = _of_raw(of_method, np.array(matrix), np.array(offset), slope, *uncertain)
