@@ -49,6 +49,7 @@ __version__ = "0.1.0"
 __all__ = [
     "CalibratedReadings",
     "Calibration",
+    "Compared",
     "ConfigurationError",
     "Constants",
     "EllipsoidFit",
@@ -72,6 +73,7 @@ __all__ = [
     "WarehouseError",
     "apply",
     "calibrate",
+    "compare",
     "export",
     "fit_ellipsoid",
     "fit_joint",
@@ -94,6 +96,7 @@ _NAMES_OF = {
     ),
     "api.constants": (
         "apply",
+        "compare",
         "export",
     ),
     "api.ellipsoid": (
@@ -126,6 +129,7 @@ _NAMES_OF = {
         "UnusableFlight",
     ),
     "exports.apply": ("CalibratedReadings",),
+    "exports.autopilots.comparison": ("Compared",),
     "exports.calibration": (
         "Constants",
         "Export",
@@ -144,7 +148,7 @@ _NAMES_OF = {
 if TYPE_CHECKING:
     from fieldcal.api.calibration import Calibration, calibrate
     from fieldcal.api.clock_sync import Synchronisation, synchronise
-    from fieldcal.api.constants import apply, export
+    from fieldcal.api.constants import apply, compare, export
     from fieldcal.api.ellipsoid import EllipsoidFit, fit_ellipsoid
     from fieldcal.api.estimate import Estimate
     from fieldcal.api.joint import JointEstimate, fit_joint
@@ -163,6 +167,7 @@ if TYPE_CHECKING:
         UnusableFlight,
     )
     from fieldcal.exports.apply import CalibratedReadings
+    from fieldcal.exports.autopilots.comparison import Compared
     from fieldcal.exports.calibration import Constants, Export, Triad
     from fieldcal.simulation.archive import write_flights
     from fieldcal.simulation.experiment import Experiment, SimulatedFlight, simulate

@@ -345,6 +345,8 @@ class ReasonCode(StrEnum):
     """There is no such folder of a session."""
     NO_CALIBRATION = "no_calibration"
     """Nothing calibrated to fly with."""
+    NOT_LOADABLE = "not_loadable"
+    """Constants that an autopilot cannot take, or must not without knowing more."""
     NOT_USABLE = "not_usable"
     """Nothing of the log can be used."""
     UNIT_MISMATCH = "unit_mismatch"

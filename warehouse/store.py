@@ -25,7 +25,7 @@ from fieldcal.schemas.arrow import VERSION_KEY
 from fieldcal.schemas.columns import IS_PRIMARY, UNIT_ID
 from fieldcal.schemas.rows import UNIT_OF_OLDER_ROWS
 from fieldcal.warehouse.errors import WarehouseError, disk
-from fieldcal.warehouse.files import AroundRename, AtomicFile
+from fieldcal.warehouse.files import AroundRename, AtomicFile, write_bytes
 
 Data: TypeAlias = pl.DataFrame | pa.Table | pa.RecordBatch | Mapping[str, np.ndarray]
 
@@ -143,6 +143,15 @@ def write_table(
     with writer:
         writer.write(data)
     return writer.sha256
+
+
+def write_frame(rows: pl.DataFrame, path: Path, metadata: Mapping[str, str]) -> None:
+    """Write a frame that is no table of the warehouse's, with facts in the file's metadata, atomically."""
+    data = rows.to_arrow().replace_schema_metadata(dict(metadata))
+    buffer = io.BytesIO()
+    with pq.ParquetWriter(buffer, data.schema, **_options(data.schema)) as parquet:
+        parquet.write_table(data.combine_chunks())
+    write_bytes(path, buffer.getvalue())
 
 
 def table_bytes(data: Data, table: str) -> bytes:

@@ -15,7 +15,8 @@ from fieldcal.api.recording import Recording, as_recording
 from fieldcal.api.sensor import SensorCalibration, not_calibrated, sensor_calibration
 from fieldcal.api.vps_clock import Rates, VpsClock
 from fieldcal.errors import Refused
-from fieldcal.exports.calibration import Constants
+from fieldcal.exports.calibration import Constants, Origin, Triad
+from fieldcal.exports.flights import origin_of
 from fieldcal.flight.calibrate import CalibratedLog, LogRead, identify, overruled, read, run_stages
 from fieldcal.flight.rows import rows_frame
 from fieldcal.geometry import sensor_model
@@ -23,7 +24,7 @@ from fieldcal.logs.on_board import PRIMARY
 from fieldcal.names import SENSORS, Approach, Json, exactness
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.rows import FlightDocument, Refusable, SyncRow
-from fieldcal.stages.composition import in_log
+from fieldcal.stages.composition import ORIGIN, in_log
 from fieldcal.stages.tables import matrix, seconds
 from fieldcal.stages.vps import RATE_COLUMNS
 from fieldcal.words.flights import is_consequence
@@ -190,7 +191,10 @@ class Calibration:
         started = flight["started_at"]
         as_of = "" if started is None else started.isoformat()
         ids = {row["sensor"]: row["unit_id"] for row in self.document["calibration"] if row["sensor"] in triads}
-        return Constants(flight["vehicle_id"], flight["imu_id"], triads, as_of, ids)
+        rate_hz = flight["imu_rate_hz"]
+        return Constants(
+            flight["vehicle_id"], flight["imu_id"], triads, as_of, ids, self._origins(triads), imu_rate_hz=rate_hz
+        )
 
     def report(self, path: Path | str) -> Path:
         """Write the flight's report, one HTML file that needs no network."""
@@ -208,6 +212,14 @@ class Calibration:
 
         flight = self.document["flight"]
         return plot_calibration([self._shown(s) for s in SENSORS], f"{flight['log_uri']}: {self.verdict}")
+
+    def _origins(self, triads: Mapping[str, Triad]) -> dict[str, Origin]:
+        """Where the readings of sensors came from, as stage `composition` was told."""
+        measured = next((run.measured for run in self.runs if run.stage == "composition"), {})
+        told = measured.get(ORIGIN)
+        if not isinstance(told, Mapping):
+            return {}
+        return {name: origin_of(told, name, triad.temperature_degc) for name, triad in triads.items()}
 
     def _of_raw(self, own: SensorCalibration) -> SensorCalibration:
         """The same method's constants of the raw sensor, where an autopilot had corrected what it logged."""

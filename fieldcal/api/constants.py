@@ -2,25 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from fieldcal.api.calibration import Calibration
 from fieldcal.api.recording import Recording, as_recording
-from fieldcal.exports import FORMATS
+from fieldcal.exports import AUTOPILOTS, FORMATS, export_to
 from fieldcal.exports.apply import CalibratedReadings, apply_constants
+from fieldcal.exports.autopilots.comparison import Compared, compared
+from fieldcal.exports.autopilots.loading import Request
+from fieldcal.exports.autopilots.parameter_file import read_parameters
 from fieldcal.exports.calibration import Constants, Export
 
 
-def export(constants: Constants | Calibration, to: str = "json") -> Export:
+def export(
+    constants: Constants | Calibration,
+    to: str = "json",
+    *,
+    parameters: Mapping[str, float] | Path | str | None = None,
+    logged_raw: bool = False,
+    system_id: int = 1,
+) -> Export:
     """Write constants as another program reads them.
 
     Parameters
     ----------
     constants : Constants or Calibration
         What to fly with: `Warehouse.calibration_at`, or one flight's own.
-    to : {"px4", "ardupilot", "ros", "kalibr", "json", "c"}
-        PX4 or ArduPilot parameters, ROS 2 or Kalibr YAML, JSON, a C header. Each module of `fieldcal.exports` states
-        its target's conventions: units, signs, axes.
+    to : {"px4", "ardupilot", "ros", "imu_calib", "imu_pipeline", "kalibr", "json", "c"}
+        PX4 or ArduPilot parameters, ROS 2 or Kalibr YAML, files of two ROS packages, JSON, a C header. Each module of
+        `fieldcal.exports` states its target's conventions: units, signs, axes.
+    parameters : mapping of str to float, or Path or str, optional
+        For an autopilot: its parameters while the log was recorded, or the file of a ground station with them. Needed
+        where the log does not tell them.
+    logged_raw : bool
+        For an autopilot: it is known that nothing had corrected the readings before they were logged.
+    system_id : int
+        For PX4: MAVLink's, of the vehicle.
 
     Returns
     -------
@@ -30,7 +48,10 @@ def export(constants: Constants | Calibration, to: str = "json") -> Export:
     Raises
     ------
     ValueError
-        There is no such format.
+        There is no such format, or it is no autopilot's and something is asked of it that only concerns those.
+    FieldcalError
+        `not_loadable`: an autopilot cannot take the constants, or must not without knowing more; `not_found`,
+        `wrong_option`: the file of parameters.
     Refused
         The calibration has no sensor that was not refused.
 
@@ -46,7 +67,51 @@ def export(constants: Constants | Calibration, to: str = "json") -> Export:
     """
     if to not in FORMATS:
         raise ValueError(f"to is one of {', '.join(FORMATS)}, not {to!r}")
-    return FORMATS[to](constants.constants() if isinstance(constants, Calibration) else constants)
+    if to not in AUTOPILOTS and (parameters is not None or logged_raw):
+        raise ValueError(f"parameters and logged_raw are for {' and '.join(AUTOPILOTS)}, not for {to!r}")
+    told = read_parameters(Path(parameters)) if isinstance(parameters, Path | str) else parameters
+    own = constants.constants() if isinstance(constants, Calibration) else constants
+    return export_to(to, own, Request(told, logged_raw, system_id))
+
+
+def compare(
+    constants: Constants | Calibration,
+    *,
+    parameters: Mapping[str, float] | Path | str | None = None,
+    logged_raw: bool = False,
+) -> list[Compared]:
+    """What a vehicle's autopilot flies with beside its constants, axis by axis, and what the difference does.
+
+    Parameters
+    ----------
+    constants : Constants or Calibration
+        `Warehouse.calibration_at`, or one flight's own.
+    parameters, logged_raw : optional
+        As in `export`; without `parameters` those in the log of an autopilot.
+
+    Returns
+    -------
+    list of Compared
+
+    Raises
+    ------
+    FieldcalError
+        `not_loadable`: what it flies with is not known; `not_found`, `wrong_option`: the file of parameters.
+    Refused
+        The calibration has no sensor that was not refused.
+
+    Examples
+    --------
+    >>> import fieldcal
+    >>> try:
+    ...     fieldcal.compare(fieldcal.Constants("quad-1", "quad-1", {}, ""))
+    ... except fieldcal.FieldcalError as error:
+    ...     print(error.reason_code)
+    not_loadable
+    """
+    told = read_parameters(Path(parameters)) if isinstance(parameters, Path | str) else parameters
+    own = constants.constants() if isinstance(constants, Calibration) else constants
+    return compared(own, Request(told, logged_raw))[0]
 
 
 def apply(

@@ -11,7 +11,7 @@ import fieldcal
 from fieldcal.cli.options import AsJson, Config, Output, Root, UnusedConfig
 from fieldcal.reason_codes import ReasonCode
 
-Format = Literal["px4", "ardupilot", "ros", "kalibr", "json", "c"]
+Format = Literal["px4", "ardupilot", "ros", "imu_calib", "imu_pipeline", "kalibr", "json", "c"]
 """The names in `exports.FORMATS`, which itself would make every `--help` slow."""
 
 
@@ -22,6 +22,9 @@ def export(
     to: Annotated[Format, Parameter(name=["--format", "-f"])] = "json",
     at_temperature: float | None = None,
     unit: str | None = None,
+    params: Path | None = None,
+    logged_raw: bool = False,
+    system_id: int = 1,
     output: Output = None,
     warehouse: Root = None,
     config: UnusedConfig = None,
@@ -33,24 +36,73 @@ def export(
     vehicle
         The vehicle that flies; the constants are those of the primary units that flew last on it.
     to
-        PX4 or ArduPilot parameters, ROS 2 or Kalibr YAML, JSON, a C header.
+        PX4 or ArduPilot parameters, ROS 2 or Kalibr YAML, files of ROS packages, JSON, a C header.
     at_temperature
         °C; 25 unless given. Slopes on temperature go along where the target has a place for them.
     unit
         Another unit on board, by its unit_id (fieldcal history --json tells them).
+    params
+        PX4, ArduPilot: the autopilot's parameters while the logs were recorded, as QGroundControl, Mission Planner or
+        MAVProxy saves them; else those in the logs.
+    logged_raw
+        PX4, ArduPilot: states that nothing had corrected the readings before they were logged.
+    system_id
+        PX4: MAVLink's, of the vehicle.
     output
         File to write; else stdout.
     """
+    if to not in ("px4", "ardupilot") and (params is not None or logged_raw):
+        told = f"--params and --logged-raw are for px4 and ardupilot; {to} takes the constants as they are."
+        raise fieldcal.FieldcalError(ReasonCode.WRONG_OPTION, told)
     from fieldcal.warehouse.files import write_bytes
     from fieldcal.words.talk import say
 
-    result = fieldcal.export(fieldcal.Warehouse(warehouse).calibration_at(vehicle, at_temperature, unit=unit), to)
+    constants = fieldcal.Warehouse(warehouse).calibration_at(vehicle, at_temperature, unit=unit)
+    result = fieldcal.export(constants, to, parameters=params, logged_raw=logged_raw, system_id=system_id)
     for warning in result.warnings:
         say(warning)
     if output is None:
         print(result.text, end="")
     else:
         write_bytes(output, result.text.encode())
+    return 0
+
+
+def compare(
+    vehicle: str,
+    /,
+    *,
+    params: Path | None = None,
+    logged_raw: bool = False,
+    at_temperature: float | None = None,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: UnusedConfig = None,
+) -> int:
+    """What a vehicle's autopilot flies with beside what the history says, and whether it matters. Nothing is written.
+
+    Parameters
+    ----------
+    vehicle
+        The vehicle that flies: the units that were on board last.
+    params
+        What is loaded, as QGroundControl, Mission Planner or MAVProxy saves it; else the parameters in the last log.
+    logged_raw
+        States that nothing had corrected the readings of other logs than an autopilot's.
+    at_temperature
+        °C; 25 unless given.
+    """
+    from dataclasses import asdict
+
+    from fieldcal.cli.show import console, print_json, table
+    from fieldcal.exports.autopilots.comparison import COLUMNS, lines
+
+    constants = fieldcal.Warehouse(warehouse).calibration_at(vehicle, at_temperature)
+    rows = fieldcal.compare(constants, parameters=params, logged_raw=logged_raw)
+    if as_json:
+        print_json([{**asdict(row), "sd": row.sd if row.sd == row.sd else None} for row in rows])
+    else:
+        console().print(table(COLUMNS, lines(rows), title=f"{vehicle}: what it flies with, and what is estimated"))
     return 0
 
 
@@ -72,8 +124,8 @@ def apply(
     log
         A log: MCAP, ROS bag (file or folder), PX4 ULog, ArduPilot .bin or CSV, or a folder with imu.csv.
     output
-        NAME.mcap: ROS 2 Imu and MagneticField in body axes (REP-103). Anything else: a folder for imu.parquet and
-        magnetometer.parquet, in the sensor axes as logged.
+        NAME.mcap: ROS 2 Imu and MagneticField in body axes (REP-103). NAME.csv, NAME.parquet: one table, in the sensor
+        axes as logged. A name without an ending: a folder for imu.parquet and magnetometer.parquet.
     vehicle
         The vehicle; else the folder two levels above the log.
     at_temperature

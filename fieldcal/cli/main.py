@@ -13,7 +13,7 @@ from cyclopts import App, CycloptsError, Parameter
 import fieldcal
 from fieldcal.cli.config import config_app
 from fieldcal.cli.drift import drift
-from fieldcal.cli.fly import apply, export
+from fieldcal.cli.fly import apply, compare, export
 from fieldcal.cli.interrupt import interruptible
 from fieldcal.cli.look import init, inspect
 from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
@@ -29,6 +29,7 @@ USAGE_CODES = (
     ReasonCode.NO_ARCHIVE,
     ReasonCode.NO_SESSION,
     ReasonCode.OUTSIDE_ARCHIVES,
+    ReasonCode.NOT_LOADABLE,
     ReasonCode.SQL_REFUSED,
     ReasonCode.SQL_WRONG,
     ReasonCode.WRONG_OPTION,
@@ -393,4 +394,5 @@ app.command(trigger)
 app.command(simulate)
 app.command(drift)
 app.command(export)
+app.command(compare)
 app.command(apply)

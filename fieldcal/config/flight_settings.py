@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from fieldcal.config.configuration import Vehicle, VehicleTable
+from fieldcal.config.loaded import Loaded
 from fieldcal.config.parameters import Parameters
 from fieldcal.geometry.earth_field import UNIT_IN_TESLA, in_unit, world_magnetic_model
 from fieldcal.geometry.rotation import Array
@@ -37,7 +38,9 @@ class FlightSettings:
     nominal_scale : |scale| from logged to calibrated unit, None where nobody knows it (counts)
     reference_reading : d0 of `zero_bias`, None leaves it to the readings
     applied_matrix, applied_offset : what an autopilot had made of raw readings before it logged them (`logs.applied`),
-        whether that is known whole, and how far it changed within the flight; None where they are raw
+        whether that is known whole, how far it changed within the flight, and how the offset follows the temperature;
+        None where they are raw
+    loaded : what an autopilot had loaded for a sensor, None where no autopilot wrote the log
     own_sensors : those of the unit that is calibrated; the others only help
     """
 
@@ -61,6 +64,8 @@ class FlightSettings:
     applied_known: Mapping[Sensor, bool | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
     applied_matrix_sd: Mapping[Sensor, float | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
     applied_offset_sd: Mapping[Sensor, Triple | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
+    applied_offset_per_degc: Mapping[Sensor, Triple | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
+    loaded: Mapping[Sensor, Loaded | None] = field(default_factory=lambda: dict.fromkeys(SENSORS))
     own_sensors: tuple[Sensor, ...] = SENSORS
 
     def changed(self, **changes: object) -> FlightSettings:

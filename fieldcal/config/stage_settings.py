@@ -13,6 +13,7 @@ from typing import TypeVar, cast
 from pydantic import TypeAdapter, ValidationError
 
 from fieldcal.config.flight_settings import FlightSettings
+from fieldcal.config.loaded import Loaded
 from fieldcal.names import (
     Approach,
     AttitudeFit,
@@ -309,7 +310,7 @@ class ChoiceSettings(Axes, NominalScale):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompositionSettings(StageSettings):
+class CompositionSettings(Axes, LocalField):
     """Stage `composition`."""
 
     applied_matrix: Mapping[Sensor, Rotation | None]
@@ -317,6 +318,9 @@ class CompositionSettings(StageSettings):
     applied_known: Mapping[Sensor, bool | None]
     applied_matrix_sd: Mapping[Sensor, float | None]
     applied_offset_sd: Mapping[Sensor, Triple | None]
+    applied_offset_per_degc: Mapping[Sensor, Triple | None]
+    gravity_sign: str
+    loaded: Mapping[Sensor, Loaded | None]
     own_sensors: tuple[Sensor, ...]
 
 

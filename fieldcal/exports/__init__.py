@@ -5,18 +5,34 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from fieldcal.exports.ardupilot import ardupilot
+from fieldcal.exports.autopilots.ardupilot import ardupilot
+from fieldcal.exports.autopilots.loading import Request
+from fieldcal.exports.autopilots.px4 import px4
 from fieldcal.exports.c_header import c_header
 from fieldcal.exports.calibration import Constants, Export
 from fieldcal.exports.json_document import json_document
-from fieldcal.exports.px4 import px4
-from fieldcal.exports.yaml_text import kalibr, ros
+from fieldcal.exports.kalibr import kalibr
+from fieldcal.exports.ros import imu_calib, imu_pipeline, ros
 
-FORMATS: dict[str, Callable[[Constants], Export]] = {
-    "px4": px4,
-    "ardupilot": ardupilot,
+AUTOPILOTS: dict[str, Callable[[Constants, Request | None], Export]] = {"px4": px4, "ardupilot": ardupilot}
+"""Those that something is asked of."""
+PROGRAMS: dict[str, Callable[[Constants], Export]] = {
     "ros": ros,
+    "imu_calib": imu_calib,
+    "imu_pipeline": imu_pipeline,
     "kalibr": kalibr,
     "json": json_document,
     "c": c_header,
 }
+FORMATS = (*AUTOPILOTS, *PROGRAMS)
+
+
+def export_to(to: str, constants: Constants, request: Request | None = None) -> Export:
+    """Constants in one of `FORMATS`. `request`: for autopilots only.
+
+    Raises
+    ------
+    FieldcalError
+        `not_loadable`: an autopilot cannot take them, or must not without knowing more.
+    """
+    return AUTOPILOTS[to](constants, request) if to in AUTOPILOTS else PROGRAMS[to](constants)

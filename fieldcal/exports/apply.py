@@ -1,5 +1,4 @@
-"""`fieldcal apply`: a log's readings through the constants its vehicle flies with, as Parquet or MCAP. The log is only
-read."""
+"""`fieldcal apply`: a log's readings through the constants its vehicle flies with. The log is only read."""
 
 from __future__ import annotations
 
@@ -13,23 +12,14 @@ import polars as pl
 from fieldcal.config.configuration import Vehicle
 from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.errors import FieldcalError
+from fieldcal.exports.calibrated_files import TABLE_OF, write_calibrated
 from fieldcal.exports.calibration import Constants, Triad
-from fieldcal.geometry import sensor_model
-from fieldcal.geometry.earth_field import UNIT_IN_TESLA
-from fieldcal.geometry.frames import FRD_FROM_FLU
 from fieldcal.geometry.rotation import Array
 from fieldcal.logs import ingest
 from fieldcal.logs.facts import Facts
-from fieldcal.logs.mcap.write import imu_channel, magnetic_field_channel, temperature_channel, write_mcap
 from fieldcal.names import INERTIAL_FIRST, Sensor, Verdict
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.stages.tables import columns_of, matrix, triad
-from fieldcal.warehouse.errors import disk
-from fieldcal.warehouse.store import TableWriter
-
-TABLE_OF: dict[str, str] = {Sensor.GYROSCOPE: "imu", Sensor.ACCELEROMETER: "imu", Sensor.MAGNETOMETER: "magnetometer"}
-FLU_FROM_FRD = FRD_FROM_FLU.T
-SPECIFIC_FORCE = {"gravity": -1.0, "specific_force": 1.0}
+from fieldcal.stages.tables import matrix, triad
 
 
 @dataclass(frozen=True)
@@ -70,18 +60,21 @@ class CalibratedReadings:
     warnings: tuple[str, ...]
 
     def write(self, output: Path | str) -> tuple[list[Path], tuple[str, ...]]:
-        """Write the readings; the files, and what the format cannot say.
+        """Write the readings, whatever the log's own format; the files, and what the format cannot say.
 
         Parameters
         ----------
         output : Path or str
-            ``NAME.mcap``: one file of ROS 2 Imu and MagneticField in body axes (REP-103). Anything else: a folder for
-            imu.parquet and magnetometer.parquet, in the sensor axes as logged.
+            ``NAME.mcap``: one file of ROS 2 Imu and MagneticField in body axes (REP-103). ``NAME.csv``,
+            ``NAME.parquet``: one table, a row a stamp, in the sensor axes as logged. A name without an ending: a folder
+            for imu.parquet and magnetometer.parquet, as the signals of a warehouse.
+
+        Raises
+        ------
+        FieldcalError
+            `wrong_option`: the name has another ending.
         """
-        place = Path(output)
-        if place.suffix.lower() == ".mcap":
-            return [place], write_ros(self, place)
-        return write_parquet(self, place), ()
+        return write_calibrated(self, Path(output))
 
 
 def apply_constants(
@@ -136,71 +129,6 @@ def raw_readings(logged: Array, sensor: Sensor, settings: FlightSettings) -> Arr
     its parameters is undone."""
     p, o = settings.applied_matrix[sensor], settings.applied_offset[sensor]
     return logged if p is None or o is None else np.linalg.solve(np.array(p), (logged - np.array(o)).T).T
-
-
-def write_parquet(c: CalibratedReadings, folder: Path) -> list[Path]:
-    """imu.parquet and magnetometer.parquet: the signal tables with calibrated values, in the sensor axes as logged."""
-    with disk(folder, "made"):
-        folder.mkdir(parents=True, exist_ok=True)
-    metadata = {
-        "calibrated": "z = scale * logged + bias, sensor axes as logged, gravity sign as declared",
-        "vehicle_id": c.constants.vehicle_id,
-        "imu_id": c.constants.imu_id,
-        "constants_as_of": c.constants.as_of,
-        "gravity_sign": c.settings.gravity_sign,
-    }
-    units: dict[str, str] = {name: c.constants.triads[name].unit for name in c.readings}
-    written = []
-    for table in ("imu", "magnetometer"):
-        own = [name for name in c.readings if TABLE_OF[name] == table]
-        if not own:
-            continue
-        t_ns = c.readings[own[0]][0]
-        columns = {"t_ns": t_ns}
-        for name in INERTIAL_FIRST:
-            if TABLE_OF[name] == table:
-                values = c.readings[name][1] if name in own else np.full((len(t_ns), 3), np.nan)
-                columns |= columns_of(values, triad(name))
-        path = folder / f"{table}.parquet"
-        frame = pl.DataFrame(columns).with_columns(pl.col(pl.Float64).fill_nan(None))
-        with TableWriter(table, path, units=units, metadata=metadata) as writer:
-            writer.write(frame)
-        written.append(path)
-    return written
-
-
-def write_ros(c: CalibratedReadings, path: Path) -> tuple[str, ...]:
-    """One MCAP of `sensor_msgs/Imu` and `MagneticField` by REP-103 and 145: body axes forward, left, up; specific
-    force; rad/s, m/s² and tesla. What it cannot say is returned."""
-    body = FLU_FROM_FRD @ sensor_model.frd_from_sensor(c.settings.rotation_body_from_sensor, c.settings.body)
-    channels, warnings = [], []
-    gyroscope, accelerometer = c.readings.get(Sensor.GYROSCOPE), c.readings.get(Sensor.ACCELEROMETER)
-    either = gyroscope or accelerometer
-    if either is not None:
-        nothing = np.full((len(either[0]), 3), np.nan)
-        sign = SPECIFIC_FORCE[c.settings.gravity_sign]
-        rate = nothing if gyroscope is None else gyroscope[1] @ body.T
-        force = nothing if accelerometer is None else sign * accelerometer[1] @ body.T
-        channels.append(imu_channel(either[0], None, rate, force, topic="/imu/data", frame_id="base_link"))
-    if (magnetometer := c.readings.get(Sensor.MAGNETOMETER)) is not None:
-        unit = c.constants.triads[Sensor.MAGNETOMETER].unit
-        factor, topic = UNIT_IN_TESLA.get(unit), "/imu/mag"
-        if factor is None:
-            factor, topic = 1.0, "/imu/mag_norm"
-            warnings.append(
-                f"magnetometer: in units of the local field, whose strength is not configured; {topic} is not in tesla."
-            )
-        field = factor * magnetometer[1] @ body.T
-        channels.append(magnetic_field_channel(magnetometer[0], None, field, topic=topic, frame_id="base_link"))
-    if c.temperature is not None and not c.temperature.is_empty():
-        t_ns, warm = c.temperature["t_ns"].to_numpy(), c.temperature["temperature_degc"].to_numpy()
-        channels.append(temperature_channel(t_ns, None, warm, frame_id="base_link"))
-    with disk(path, "written"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_name(path.name + ".part")
-        write_mcap(unfinished, channels, metadata={"body": "flu", "gravity_sign": "specific_force"})
-        unfinished.replace(path)
-    return tuple(warnings)
 
 
 def _temperature_at(t_ns: np.ndarray, temperature: pl.DataFrame | None) -> Array | None:

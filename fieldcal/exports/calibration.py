@@ -8,17 +8,27 @@ Eq. 5 with its offset in logged units: autopilots subtract before they scale, an
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fieldcal.config.loaded import Loaded
 from fieldcal.geometry.rotation import Array
+from fieldcal.names import Rotation
+
+NOT_TURNED: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def cubic_about(first: Array, second: Array, third: Array, by_degc: float) -> tuple[Array, Array, Array]:
     """Coefficients of d, d² and d³ of a cubic that had these about a point `by_degc` below: c(d + by) − c(by)."""
     return first + 2.0 * second * by_degc + 3.0 * third * by_degc**2, second + 3.0 * third * by_degc, third
+
+
+def through(matrix: Array, v: Array) -> Array:
+    """matrix · v, where an unknown or infinite element of v concerns only what it has a part in."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(matrix == 0.0, 0.0, matrix * v).sum(axis=1))
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,8 @@ class Triad:
         Lowest and highest temperature of the history, °C; None without a slope.
     why : tuple of str
         Where the numbers come from.
+    zero_per_degc_sd : (3,) array
+        One standard deviation of zero's slope; infinite where no slope is known, 0 where it is taken as it is.
 
     Examples
     --------
@@ -65,11 +77,31 @@ class Triad:
     why: tuple[str, ...]
     zero_per_degc2: Array = field(default_factory=lambda: np.zeros(3))
     zero_per_degc3: Array = field(default_factory=lambda: np.zeros(3))
+    zero_per_degc_sd: Array = field(default_factory=lambda: np.zeros(3))
 
     @property
     def diagonal(self) -> bool:
         """Whether the axes are independent: no soft iron, no cross-axis terms."""
         return bool(np.array_equal(self.scale, np.diag(np.diagonal(self.scale))))
+
+    def turned(self, turn: Array) -> Triad:
+        """The same constants in other axes: of readings and results that `turn`, (3, 3) orthogonal, was applied to.
+
+        The standard deviation of Λ is that of its diagonal, as far as the diagonal as it was tells.
+        """
+        square = turn**2
+        return replace(
+            self,
+            scale=turn @ self.scale @ turn.T,
+            scale_per_degc=turn @ self.scale_per_degc @ turn.T,
+            zero=turn @ self.zero,
+            zero_per_degc=turn @ self.zero_per_degc,
+            zero_per_degc2=turn @ self.zero_per_degc2,
+            zero_per_degc3=turn @ self.zero_per_degc3,
+            scale_sd=np.sqrt(through(square**2, self.scale_sd**2)),
+            zero_sd=np.sqrt(through(square, self.zero_sd**2)),
+            zero_per_degc_sd=np.sqrt(through(square, self.zero_per_degc_sd**2)),
+        )
 
     def apply(self, logged: ArrayLike, temperature_degc: ArrayLike | None = None) -> Array:
         """z (n, 3) from readings (n, 3), at T0 or at a temperature (n,) for each; where it is NaN at T0."""
@@ -81,6 +113,40 @@ class Triad:
         bend = self.zero_per_degc2 + warmer * self.zero_per_degc3
         off = z - self.zero - warmer * (self.zero_per_degc + warmer * bend)
         return np.asarray(off @ self.scale.T + warmer * (off @ self.scale_per_degc.T))
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a sensor's readings came from, as their log and fieldcal.toml tell: what has to be known before constants
+    are put back there.
+
+    Attributes
+    ----------
+    loaded : Loaded or None
+        What the autopilot that wrote the log had loaded; the constants are those of the raw sensor. None: no autopilot
+        wrote it, and whether one had corrected the readings is not known.
+    body : {"frd", "flu"}
+        Axes of the readings.
+    gravity_sign : {"specific_force", "gravity"}
+        What an accelerometer reads at rest.
+    rotation_body_from_sensor : rows of a (3, 3) matrix
+    temperature_degc : float or None
+        Of the flight, °C: that of a zero whose slope is not known.
+    horizontal_field_g : float or None
+        North and east of the local field, gauss; None where its strength is not known.
+
+    Examples
+    --------
+    >>> Origin().body
+    'frd'
+    """
+
+    loaded: Loaded | None = None
+    body: str = "frd"
+    gravity_sign: str = "specific_force"
+    rotation_body_from_sensor: Rotation = NOT_TURNED
+    temperature_degc: float | None = None
+    horizontal_field_g: float | None = None
 
 
 @dataclass(frozen=True)
@@ -97,6 +163,12 @@ class Constants:
         ISO 8601 of the latest flight that they come from; empty when its clock is unknown.
     unit_ids : mapping of str to str
         Sensor → the unit that its constants belong to; empty where that is not told.
+    origins : mapping of str to Origin
+        Sensor → where its readings came from; a sensor of which that is not known is left out.
+    further : tuple of Constants
+        Those of further units on board, for targets that have a place for each.
+    imu_rate_hz : float or None
+        Rate of the latest flight's readings.
 
     Examples
     --------
@@ -109,6 +181,9 @@ class Constants:
     triads: Mapping[str, Triad]
     as_of: str
     unit_ids: Mapping[str, str] = field(default_factory=dict)
+    origins: Mapping[str, Origin] = field(default_factory=dict)
+    further: tuple[Constants, ...] = ()
+    imu_rate_hz: float | None = None
 
     @property
     def heading(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Literal, TypedDict
@@ -11,6 +12,7 @@ import polars as pl
 
 from fieldcal.errors import FieldcalError
 from fieldcal.exports.calibration import Constants, Triad, cubic_about
+from fieldcal.exports.flights import Flights
 from fieldcal.names import INERTIAL_FIRST
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.columns import FLOWN_ORDER
@@ -20,7 +22,8 @@ from fieldcal.warehouse.questions import existing, units_flown
 from fieldcal.words.rows import typed
 
 _QUESTION = """
-SELECT a.*, l.slope_per_degc, l.curve_per_degc2, l.curve_per_degc3, l.temperature_min_degc, l.temperature_max_degc
+SELECT a.*, l.slope_per_degc, l.slope_per_degc_sd, l.curve_per_degc2, l.curve_per_degc3,
+    l.temperature_min_degc, l.temperature_max_degc
 FROM calibration_at(?) AS a
 JOIN latest_calibration AS l USING (unit_id, sensor, parameter, axis)
 WHERE a.vehicle_id = ? AND a.parameter IN ('scale', 'zero')
@@ -32,6 +35,7 @@ class _Axis(TypedDict):
 
     imu_id: str
     unit_id: str
+    is_primary: bool
     parameter: str
     axis: str
     value: float
@@ -41,10 +45,11 @@ class _Axis(TypedDict):
     started_at: datetime | None
     why: str
     slope_per_degc: float | None
+    slope_per_degc_sd: float | None
     curve_per_degc2: float | None
     curve_per_degc3: float | None
-    temperature_min_degc: float
-    temperature_max_degc: float
+    temperature_min_degc: float | None
+    temperature_max_degc: float | None
 
 
 _Number = Literal["value", "sd", "slope_per_degc", "curve_per_degc2", "curve_per_degc3"]
@@ -74,24 +79,39 @@ def constants_of(
             ReasonCode.NO_CALIBRATION, f"No calibration of vehicle {vehicle_id!r} is known; there is: {there}."
         )
     if unit_id is None:
-        rows = rows.join(units_flown(warehouse, vehicle_id), on=["sensor", "unit_id"], how="semi")
+        own = rows.join(units_flown(warehouse, vehicle_id), on=["sensor", "unit_id"], how="semi")
     else:
-        rows = rows.filter(pl.col("unit_id") == unit_id)
-    if rows.is_empty():
+        own = rows.filter(pl.col("unit_id") == unit_id)
+    if own.is_empty():
         told = "" if unit_id is None else f" of unit {unit_id!r}; there is: {', '.join(units)}"
         raise FieldcalError(ReasonCode.NO_CALIBRATION, f"No calibration of vehicle {vehicle_id!r} is known{told}.")
-    last = rows.sort(FLOWN_ORDER, nulls_last=False).row(-1, named=True)
-    triads: dict[str, Triad] = {
-        s: triad for s in INERTIAL_FIRST if (triad := _triad(rows.filter(sensor=s), at)) is not None
-    }
-    if not triads:
+    flights = Flights(warehouse, vehicle_id)
+    constants = _constants(vehicle_id, own, at, flights)
+    if constants is None:
         raise FieldcalError(
             ReasonCode.NO_CALIBRATION,
             f'No sensor of {vehicle_id!r} has all its axes calibrated; `fieldcal sql "FROM refusals"` says why.',
         )
+    if unit_id is not None:
+        return constants
+    beside = [rows.filter(pl.col("unit_id") == one) for one in flights.further]
+    further = [one for part in beside if (one := _constants(vehicle_id, part, at, flights)) is not None]
+    return replace(constants, further=tuple(further))
+
+
+def _constants(vehicle_id: str, rows: pl.DataFrame, at: float, flights: Flights) -> Constants | None:
+    """Constants from the rows of units; None where no sensor has all its axes."""
+    triads: dict[str, Triad] = {
+        s: triad for s in INERTIAL_FIRST if (triad := _triad(rows.filter(sensor=s), at)) is not None
+    }
+    if not triads:
+        return None
+    last = rows.sort(FLOWN_ORDER, nulls_last=False).row(-1, named=True)
     as_of = "" if last["started_at"] is None else last["started_at"].isoformat()
     ids = {s: str(rows.filter(sensor=s)["unit_id"][0]) for s in triads}
-    return Constants(vehicle_id, str(last["imu_id"]), triads, as_of, ids)
+    origins = {s: origin for s in triads if (origin := flights.origin(s, rows.filter(sensor=s))) is not None}
+    rate_hz = flights.imu_rate_hz(str(last["flight_id"]))
+    return Constants(vehicle_id, str(last["imu_id"]), triads, as_of, ids, origins, imu_rate_hz=rate_hz)
 
 
 def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
@@ -116,12 +136,14 @@ def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
     # The curve about 25 °C, brought to the temperature that is asked for.
     first, second, third = (vector("zero", c) for c in _CURVE)
     slope, square, cube = cubic_about(first, second, third, at - REFERENCE_DEGC)
-    sloped = [row for row in found.values() if row["slope_per_degc"] is not None]
-    flown = (
-        (max(r["temperature_min_degc"] for r in sloped), min(r["temperature_max_degc"] for r in sloped))
-        if sloped
-        else None
-    )
+    spans = [
+        (low, high)
+        for row in found.values()
+        if row["slope_per_degc"] is not None
+        and (low := row["temperature_min_degc"]) is not None
+        and (high := row["temperature_max_degc"]) is not None
+    ]
+    flown = (max(low for low, _ in spans), min(high for _, high in spans)) if spans else None
     return Triad(
         scale=matrix("value"),
         zero=vector("zero", "value"),
@@ -129,6 +151,7 @@ def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
         zero_per_degc=slope,
         zero_per_degc2=square,
         zero_per_degc3=cube,
+        zero_per_degc_sd=_slope_sd([found["zero", axis] for axis in AXES]),
         scale_sd=vector("scale", "sd", np.nan),
         zero_sd=vector("zero", "sd", np.nan),
         unit=_calibrated_unit(found),
@@ -139,6 +162,12 @@ def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
             f"{parameter} {axis}: {found[parameter, axis]['why']}" for parameter in ("scale", "zero") for axis in AXES
         ),
     )
+
+
+def _slope_sd(rows: list[_Axis]) -> np.ndarray:
+    """(3,): infinite where no slope is known, 0 where nobody knows how well."""
+    known = [None if row["slope_per_degc"] is None else row["slope_per_degc_sd"] or 0.0 for row in rows]
+    return np.array([np.inf if sd is None else sd for sd in known])
 
 
 def _calibrated_unit(found: dict[tuple[str, str], _Axis]) -> str:

@@ -40,7 +40,7 @@ def units_of(facts: Facts, vehicle: Vehicle, imu_id: str) -> list[Unit]:
     """
     configured = imu_id != vehicle.vehicle_id
     board = imu_id if configured else facts["board_id"] or imu_id
-    on_board = facts["units_on_board"] or [{"table": PRIMARY, "devices": {}, "applied": {}}]
+    on_board = facts["units_on_board"] or [{"table": PRIMARY, "devices": {}, "applied": {}, "loaded": {}}]
     units = []
     for one in on_board[: None if vehicle.units_on_board == "all" else 1]:
         primary = one["table"] == PRIMARY

@@ -15,13 +15,15 @@ class Applied(TypedDict):
     """logged = matrix · raw + offset, raw readings in the axes of the logged ones: the mounting is taken out.
 
     `matrix` (3, 3) symmetric; `offset` (3,) in the logged unit, at the flight's temperatures; `matrix_sd`, `offset_sd`
-    (3,): how far they changed within the flight; `parameters`: those of the longest stretch; `known`: false where the
-    log does not have them, so that what was done is not known."""
+    (3,): how far they changed within the flight; `offset_per_degc` (3,): slope of the offset over temperature, where
+    the autopilot compensates for it; `parameters`: those of the longest stretch; `known`: false where the log does not
+    have them, so that what was done is not known."""
 
     matrix: list[list[float]]
     offset: list[float]
     matrix_sd: float
     offset_sd: list[float]
+    offset_per_degc: list[float]
     parameters: dict[str, float]
     known: bool
 
@@ -47,6 +49,7 @@ def applied(sources: Sequence[SensorSource], first_ns: int, last_ns: int) -> dic
             "offset": offset.tolist(),
             "matrix_sd": float(np.sqrt(np.max(np.tensordot(weight, (matrices - matrix) ** 2, 1)))),
             "offset_sd": np.sqrt(weight @ (offsets - offset) ** 2).tolist(),
+            "offset_per_degc": (weight @ np.array([one.offset_per_degc for one in source.corrections])).tolist(),
             "known": all(one.parameters for one in source.corrections),
             "parameters": dict(source.corrections[int(np.argmax(weight))].parameters),
         }

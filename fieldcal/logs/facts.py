@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TypedDict
 
+from fieldcal.config.loaded import Autopilot
 from fieldcal.logs.applied import Applied
 
 
@@ -35,15 +36,26 @@ class Judged(TypedDict):
     findings: list[FindingFacts]
 
 
+class LoadedFacts(TypedDict):
+    """`config.loaded.Loaded` as plain JSON."""
+
+    autopilot: Autopilot
+    device_id: int | None
+    rotation: list[list[float]]
+    parameters: dict[str, float]
+
+
 class UnitFacts(TypedDict):
     """One unit on board. `table`: of its readings, "imu" of the primary one, which has the primary magnetometer as
     well, "imu.1", "magnetometer.1", … of a further one. `devices`: what tells each of its sensors from others on board
     (`SensorSource.unit_id`); empty where the log does not tell. `applied`: what an autopilot had done to the readings
-    of each sensor that enters the unit's estimate, the primary magnetometer's too."""
+    of each sensor that enters the unit's estimate, the primary magnetometer's too. `loaded`: what an autopilot had
+    loaded for them; sensors of other logs are absent."""
 
     table: str
     devices: dict[str, str]
     applied: dict[str, Applied]
+    loaded: dict[str, LoadedFacts]
 
 
 class Facts(Declared, Judged):

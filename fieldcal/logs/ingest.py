@@ -17,10 +17,11 @@ import polars as pl
 
 from fieldcal.config.configuration import Vehicle
 from fieldcal.config.flight_settings import FlightSettings, flight_settings
+from fieldcal.config.loaded import Loaded
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs import SIGNAL_COLUMNS, Finding, LogReader, LogSummary, open_log
 from fieldcal.logs.discovery import folder_parts
-from fieldcal.logs.facts import Declared, Facts, FindingFacts, Judged
+from fieldcal.logs.facts import Declared, Facts, FindingFacts, Judged, UnitFacts
 from fieldcal.logs.interface import EPOCH_KNOWN_AFTER_NS
 from fieldcal.logs.on_board import PRIMARY, UNIT_TABLES, units_on_board
 from fieldcal.logs.tidy import HELD_ROWS, Disordered, TidySignal
@@ -292,7 +293,16 @@ def settings_of(facts: Facts, vehicle: Vehicle, unit: str = PRIMARY) -> FlightSe
         applied_known={s: known[s]["known"] if s in known else None for s in SENSORS},
         applied_matrix_sd={s: known[s]["matrix_sd"] if s in known else None for s in SENSORS},
         applied_offset_sd={s: _triple(known[s]["offset_sd"]) if s in known else None for s in SENSORS},
+        applied_offset_per_degc={s: _triple(known[s]["offset_per_degc"]) if s in known else None for s in SENSORS},
+        loaded={s: _loaded(on_board, s) for s in SENSORS},
     )
+
+
+def _loaded(on_board: UnitFacts | None, sensor: Sensor) -> Loaded | None:
+    own = None if on_board is None else on_board["loaded"].get(sensor)
+    if own is None:
+        return None
+    return Loaded(own["autopilot"], own["device_id"], _rows_of(own["rotation"]), own["parameters"])
 
 
 def _triple(values: list[float]) -> Triple:

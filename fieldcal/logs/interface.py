@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldcal.config.loaded import Autopilot
 from fieldcal.config.values import UNITS
 from fieldcal.names import SENSORS, Sensor
 from fieldcal.reason_codes import ReasonCode
@@ -92,7 +93,8 @@ class SensorSource:
     "magnetometer.1", … of the further ones. `unit_id` names the unit within the vehicle: by device id, else by topic
     and frame, else by instance; empty where it is the vehicle's `imu_id`. `stream`: message or topic, with its
     instance. `filtered`: low-passed, or averaged over intervals, by the autopilot. `corrections`: in order of
-    `from_ns`; empty where the readings are raw.
+    `from_ns`; empty where the readings are raw. `autopilot`: which one wrote the log; `parameters`: its own that
+    concern the sensor, as they stood at the end of the log.
     """
 
     sensor: Sensor
@@ -104,6 +106,8 @@ class SensorSource:
     filtered: bool = False
     device_id: int | None = None
     corrections: tuple[Correction, ...] = ()
+    autopilot: Autopilot | None = None
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def corrected(self) -> bool:

@@ -11,6 +11,7 @@ from collections.abc import Collection, Sequence
 from fieldcal.logs.applied import applied
 from fieldcal.logs.facts import UnitFacts
 from fieldcal.logs.interface import SIGNAL_COLUMNS, LogSummary, SensorSource
+from fieldcal.logs.loaded import loaded
 from fieldcal.names import Sensor
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import signal_kind
@@ -49,6 +50,7 @@ def _unit(unit: str, sources: Sequence[SensorSource], first_ns: int, last_ns: in
         "table": unit,
         "devices": {str(one.sensor): one.unit_id for one in own},
         "applied": applied(used, first_ns, last_ns),
+        "loaded": loaded(used),
     }
 
 

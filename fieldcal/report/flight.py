@@ -18,6 +18,7 @@ from fieldcal.report.page import Column, Folded, Notice, Page, Part, Section, Ta
 from fieldcal.report.words import count, day, plain_name, scientific, unit, with_unit
 from fieldcal.schemas.rows import CalibrationRow, FitRow, UnfoldedFlight, UnfoldedRun
 from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
+from fieldcal.stages.composition import ORIGIN
 from fieldcal.stages.tables import AXES
 from fieldcal.words.flights import QUANTITIES, advised, is_consequence, sync_sentence
 from fieldcal.words.numbers import cell, number
@@ -381,7 +382,7 @@ def _stages(data: FlightData) -> list[Part]:
 
 def _numbers(measured: Mapping[str, Json] | None) -> str:
     """What a stage measured, in a line."""
-    return ", ".join(f"{k} = {_plain(v)}" for k, v in (measured or {}).items() if k != "reason")
+    return ", ".join(f"{k} = {_plain(v)}" for k, v in (measured or {}).items() if k not in ("reason", ORIGIN))
 
 
 def _plain(value: Json) -> str:

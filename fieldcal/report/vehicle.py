@@ -9,6 +9,8 @@ from pathlib import Path
 import polars as pl
 
 from fieldcal.errors import FieldcalError
+from fieldcal.exports.autopilots.comparison import COLUMNS, compared, lines
+from fieldcal.exports.calibration_at import constants_of
 from fieldcal.names import GRAVEST_FIRST, SENSORS, DriftStatus, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.report.history import LatestCalibration, RefusedRow, as_of_sentence, newest, reason_of, usable_flights
@@ -56,7 +58,7 @@ def vehicle_page(root: Path, vehicle_id: str, links: Links, as_of: datetime | No
         ("IMU", imus[0] if len(imus) == 1 else f"{imus[0]}; before: {', '.join(imus[1:])}"),
     ]
     sections = [
-        Section("fly", "What to fly with", _fly_with(warehouse, flown)),
+        Section("fly", "What to fly with", [*_fly_with(warehouse, flown), *_before_and_after(root, vehicle_id)]),
         Section("trend", "Trends", _trends(current, usable.height)),
         *_parameters(warehouse, vehicle_id, units, drift),
         Section("agreement", "Agreement", _agreement(warehouse, vehicle_id)),
@@ -131,6 +133,22 @@ def _sources(by_axis: Mapping[str, LatestCalibration]) -> str:
     if len(axes) == 1:
         return next(iter(axes))
     return " ".join(f"{', '.join(names)}: {source}" for source, names in axes.items())
+
+
+def _before_and_after(root: Path, vehicle_id: str) -> list[Part]:
+    """What its autopilot flies with, where the logs tell."""
+    try:
+        rows, _ = compared(constants_of(root, vehicle_id))
+    except FieldcalError:
+        return []
+    numeric = ("flies with", "estimate", "difference", "which is")
+    return [
+        Table(
+            "What the autopilot flew with beside what is estimated (fieldcal compare)",
+            tuple(Column(name, "n") if name in numeric else Column(name) for name in COLUMNS),
+            lines(rows),
+        )
+    ]
 
 
 def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import polars as pl
 
+from fieldcal.geometry.earth_field import UNIT_IN_TESLA
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import RESIDUAL, SENSORS, Json, Status
 from fieldcal.reason_codes import ReasonCode
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from fieldcal.config.stage_settings import CompositionSettings
 
 COMPOSED = ("scale", "bias", "zero", "zero_bias")
+ORIGIN = "origin"
+"""Among what the stage measured: where its readings come from."""
 SQUARE = 1e-9
 """Off-diagonal share of a matrix that is rounding."""
 
@@ -34,7 +38,7 @@ def compose(tables: Tables, s: CompositionSettings) -> StageResult:
         )
     rows = pl.concat(parts).filter(pl.col("sensor").is_in(s.own_sensors))
     of_matrix, of_offset, is_known = s.applied_matrix, s.applied_offset, s.applied_known
-    matrix_sd, offset_sd = s.applied_matrix_sd, s.applied_offset_sd
+    matrix_sd, offset_sd, per_degc = s.applied_matrix_sd, s.applied_offset_sd, s.applied_offset_per_degc
     out = [rows.filter(~pl.col("sensor").is_in([name for name in SENSORS if of_matrix[name] is not None]))]
     composed: list[str] = []
     for sensor in SENSORS:
@@ -45,14 +49,33 @@ def compose(tables: Tables, s: CompositionSettings) -> StageResult:
             out.append(own)  # by nothing but its mounting
             continue
         composed.append(str(sensor))
+        slope = np.array(per_degc[sensor] or (0.0, 0.0, 0.0))
         uncertain = matrix_sd[sensor] or 0.0, np.array(offset_sd[sensor] or (0.0, 0.0, 0.0))
         for _, of_method in own.group_by("method", maintain_order=True):
-            of_raw = _of_raw(of_method, np.array(matrix), np.array(offset), *uncertain)
+            of_raw = _of_raw(of_method, np.array(matrix), np.array(offset), slope, *uncertain)
             out.append(of_raw if is_known[sensor] else _not_known(of_raw))
             residual = of_method.filter(pl.col("parameter").is_in([*COMPOSED, ZERO_SLOPE]))
             out.append(residual.with_columns(parameter=pl.lit(RESIDUAL) + pl.col("parameter")))
-    measured: dict[str, Json] = {"composed": composed} if composed else {}
+    measured: dict[str, Json] = {ORIGIN: _origin(s), **({"composed": composed} if composed else {})}
     return StageResult({"calibration": pl.concat(out)}, measured=measured)
+
+
+def _origin(s: CompositionSettings) -> dict[str, Json]:
+    """What an export has to know of the readings: their axes and signs, and what an autopilot had loaded for them."""
+    loaded = {str(sensor): asdict(own) for sensor in s.own_sensors if (own := s.loaded[sensor]) is not None}
+    return {
+        "body": s.body,
+        "gravity_sign": s.gravity_sign,
+        "rotation_body_from_sensor": s.rotation_body_from_sensor,
+        "horizontal_field_g": _horizontal_field_g(s),
+        "loaded": loaded,
+    }
+
+
+def _horizontal_field_g(s: CompositionSettings) -> float | None:
+    """By what a compass points; None where the field's strength is not known."""
+    tesla = UNIT_IN_TESLA.get(s.field_unit)
+    return None if tesla is None else float(np.hypot(*s.field_ned[:2])) * tesla / UNIT_IN_TESLA["G"]
 
 
 def _not_known(rows: pl.DataFrame) -> pl.DataFrame:
@@ -74,7 +97,7 @@ def in_log(rows: pl.DataFrame) -> pl.DataFrame:
     return rows.filter(~of_raw).with_columns(parameter=pl.col("parameter").str.strip_prefix(RESIDUAL))
 
 
-def _of_raw(rows: pl.DataFrame, p: Array, o: Array, p_sd: float, o_sd: Array) -> pl.DataFrame:
+def _of_raw(rows: pl.DataFrame, p: Array, o: Array, o_per_degc: Array, p_sd: float, o_sd: Array) -> pl.DataFrame:
     """One sensor's rows of one method. Scale and zero hardly depend on each other, and stand for the rest."""
     found = {(row["parameter"], row["axis"]): row for row in cast(list[CalibrationRow], rows.to_dicts())}
     inverse = np.linalg.inv(p)
@@ -82,7 +105,7 @@ def _of_raw(rows: pl.DataFrame, p: Array, o: Array, p_sd: float, o_sd: Array) ->
     if ZERO_SLOPE in {parameter for parameter, _ in found}:
         own = [found[ZERO_SLOPE, axis] for axis in AXES]
         slope, slope_sd = _numbers(own)
-        others += _with(own, _through(inverse, slope), np.sqrt(_through(inverse**2, slope_sd**2)))
+        others += _with(own, _through(inverse, slope - o_per_degc), np.sqrt(_through(inverse**2, slope_sd**2)))
     if ("scale", "x") not in found or ("zero", "x") not in found:
         return calibration_rows(others)
     full = ("scale", "xy") in found or np.any(np.abs(p - np.diag(np.diagonal(p))) > SQUARE)

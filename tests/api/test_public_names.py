@@ -98,6 +98,6 @@ def test_public_names_have_no_part_in_what_a_stage_is_known_by(stage: Stage) -> 
 
 
 def test_a_function_called_as_its_module_is_found() -> None:
-    """`from fieldcal.exports.px4 import px4` in the package: the path may mean either, and leads to both."""
-    reached = reach(installed("fieldcal"), ["fieldcal.exports.FORMATS"])
-    assert {("fieldcal.exports.px4", "px4"), ("fieldcal.exports.yaml_text", "ros")} <= reached.definitions
+    """`from fieldcal.exports.ros import ros` in the package: the path may mean either, and leads to both."""
+    reached = reach(installed("fieldcal"), ["fieldcal.exports.PROGRAMS"])
+    assert {("fieldcal.exports.ros", "ros"), ("fieldcal.exports.kalibr", "kalibr")} <= reached.definitions

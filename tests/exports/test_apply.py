@@ -13,7 +13,7 @@ from logs_support import EPOCH_NS, messages_by_mcap_ros2
 
 import fieldcal
 from fieldcal.errors import FieldcalError
-from fieldcal.exports import apply
+from fieldcal.exports import apply, calibrated_files
 from fieldcal.exports.calibration import Constants, Triad
 from fieldcal.logs.mcap.write import (
     MessageChannel,
@@ -169,13 +169,13 @@ def test_an_absent_sensor_is_null_in_parquet_and_marked_in_ros(tmp_path: Path) -
         constants = flown_with(sensor)
         found = calibrated(log_of(tmp_path, IMU), constants)
         for _ in range(2):
-            (path,) = apply.write_parquet(found, tmp_path / "deep" / "er" / sensor)
+            (path,) = calibrated_files.write_folder(found, tmp_path / "deep" / "er" / sensor)
         frame = pl.read_parquet(path)
         logged = {Sensor.GYROSCOPE: RATE, Sensor.ACCELEROMETER: FORCE}[sensor]
         wanted = by_hand(constants.triads[sensor], logged, 25.0)
         np.testing.assert_allclose(matrix(frame, triad(sensor)), wanted, rtol=0, atol=EQUAL)
         assert all(frame[f"{other}_{axis}"].null_count() == SAMPLES for axis in "xyz")
-        assert apply.write_ros(found, tmp_path / "far" / "off" / f"{sensor}.mcap") == ()
+        assert calibrated_files.write_ros(found, tmp_path / "far" / "off" / f"{sensor}.mcap") == ()
         messages = [m for _, m in messages_by_mcap_ros2(tmp_path / "far" / "off" / f"{sensor}.mcap", "/imu/data")]
         assert len(messages) == SAMPLES
         here, there = ("angular_velocity", "linear_acceleration")[:: 1 if sensor == Sensor.GYROSCOPE else -1]
@@ -199,7 +199,52 @@ def test_only_what_the_log_holds_is_written(
 ) -> None:
     found = calibrated(log_of(tmp_path, *channels), flown_with(*sensors))
     path = tmp_path / "out.mcap"
-    apply.write_ros(found, path)
+    calibrated_files.write_ros(found, path)
     rows = {"/imu/data": SAMPLES, "/imu/mag": SAMPLES // 2, "/imu/temperature": len(WARM_T_NS)}
     for topic, count in rows.items():
         assert len(list(messages_by_mcap_ros2(path, topic))) == (count if topic in topics else 0)
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_one_table_of_all_readings_by_the_names_ending(tmp_path: Path, ending: str) -> None:
+    """A row a stamp of any sensor; the magnetometer is at every second, temperatures between."""
+    found = calibrated(log_of(tmp_path, IMU, MAG, WARM), flown_with())
+    path = tmp_path / "far" / f"out.{ending.upper()}"
+    assert found.write(path) == ([path], ())
+    names = {"gyroscope": "gx", "accelerometer": "ax", "magnetometer": "mx"}
+    if ending == "csv":
+        lines = path.read_text().splitlines()
+        assert lines[:2] == ["t_s,gx,gy,gz,ax,ay,az,mx,my,mz,temp", "s,rad/s,rad/s,rad/s,m/s^2,m/s^2,m/s^2,T,T,T,degC"]
+        frame = pl.read_csv("\n".join([lines[0], *lines[2:]]).encode(), infer_schema_length=None)
+        whole = pl.Series([line.split(",")[0] for line in lines[2:]]).str.replace(".", "", literal=True)
+        frame = frame.with_columns(t_ns=whole.cast(pl.Int64))
+    else:
+        frame = pl.read_parquet(path)
+        assert pl.read_parquet_metadata(path)["vehicle_id"] == "v"
+        names = {sensor: f"{sensor}_x" for sensor in names}
+    assert frame["t_ns"].is_sorted()
+    assert frame["t_ns"].to_list() == sorted({*T_NS.tolist(), *WARM_T_NS.tolist()})
+    for sensor, (t_ns, z) in found.readings.items():
+        own = frame.filter(pl.col(names[sensor]).is_not_null())
+        assert own["t_ns"].to_list() == t_ns.tolist()
+        np.testing.assert_allclose(own[names[sensor]].to_numpy(), z[:, 0], rtol=1e-12)
+
+
+def test_a_written_csv_is_read_as_a_log_again(tmp_path: Path) -> None:
+    found = calibrated(log_of(tmp_path, IMU, MAG, WARM), flown_with())
+    path = tmp_path / "v" / "s" / "again.csv"
+    found.write(path)
+    again = fieldcal.read_log(path)
+    for sensor, (t_ns, z) in found.readings.items():
+        stamps, readings = again.readings(sensor)
+        np.testing.assert_allclose(stamps - stamps[0], 1e-9 * (t_ns - t_ns[0]), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(readings, z, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["out.ulg", "out.bin", "out.mcap.zip"])
+def test_an_ending_that_is_none_is_refused(tmp_path: Path, name: str) -> None:
+    found = calibrated(log_of(tmp_path, IMU), flown_with())
+    with pytest.raises(FieldcalError, match=r"written as \.mcap, \.csv or \.parquet") as caught:
+        found.write(tmp_path / name)
+    assert caught.value.reason_code == "wrong_option"
+    assert not (tmp_path / name).exists()

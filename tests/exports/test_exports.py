@@ -11,9 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
-from fieldcal.exports import FORMATS
-from fieldcal.exports.calibration import Constants, Triad
+from fieldcal.errors import FieldcalError
+from fieldcal.exports import AUTOPILOTS, FORMATS, export_to
+from fieldcal.exports.autopilots.loading import Request
+from fieldcal.exports.calibration import Constants, Export, Origin, Triad
 
 EQUAL = 1e-9
 """Largest difference of calibrated readings, relative to their size."""
@@ -51,84 +54,28 @@ def constants(**triads: Triad) -> Constants:
     return Constants("v\n1*/", "imu 7", triads, "2026-05-04T12:00:00+00:00")
 
 
+RAW_READINGS = Request(logged_raw=True)
+
+
+def export(form: str, c: Constants) -> Export:
+    return export_to(form, c, RAW_READINGS if form in AUTOPILOTS else None)
+
+
 def same(found: np.ndarray, wanted: np.ndarray) -> bool:
     return bool(np.abs(found - wanted).max() <= EQUAL * np.abs(wanted).max())
-
-
-def px4(text: str) -> dict[str, float]:
-    rows = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
-    assert {(row[0], row[1], len(row)) for row in rows} == {("1", "1", 5)}
-    return {row[2]: float(row[3]) for row in rows}
-
-
-def vector(p: dict[str, float], pattern: str) -> np.ndarray:
-    return np.array([p[pattern.replace("?", axis)] for axis in "XYZ"])
-
-
-def symmetric(diagonal: np.ndarray, off: np.ndarray) -> np.ndarray:
-    return np.array([[diagonal[0], off[0], off[1]], [off[0], diagonal[1], off[2]], [off[1], off[2], diagonal[2]]])
-
-
-@pytest.mark.parametrize("temperature", [AT, WARM])
-def test_px4(temperature: float) -> None:
-    accelerometer = replace(triad("accelerometer", warm=True), scale_per_degc=np.zeros((3, 3)))
-    gyroscope = replace(triad("gyroscope", warm=True, unit_scale=True), scale_per_degc=np.zeros((3, 3)))
-    magnetometer = triad("magnetometer", soft_iron=True)
-    export = FORMATS["px4"](constants(accelerometer=accelerometer, gyroscope=gyroscope, magnetometer=magnetometer))
-    p = px4(export.text)
-
-    def thermal(sensor: str) -> np.ndarray:
-        x = np.array([[p[f"TC_{sensor}0_X{order}_{i}"] for i in range(3)] for order in range(4)])
-        t = np.clip(temperature, p[f"TC_{sensor}0_TMIN"], p[f"TC_{sensor}0_TMAX"]) - p[f"TC_{sensor}0_TREF"]
-        return np.array([1.0, t, t**2, t**3]) @ x
-
-    at = np.full(200, temperature)
-    found = (RAW["accelerometer"] - thermal("A") - vector(p, "CAL_ACC0_?OFF")) * vector(p, "CAL_ACC0_?SCALE")
-    assert same(found, accelerometer.apply(RAW["accelerometer"], at))
-    found = RAW["gyroscope"] - thermal("G") - vector(p, "CAL_GYRO0_?OFF")
-    assert same(found, gyroscope.apply(RAW["gyroscope"], at))
-    gauss = 1e4 * RAW["magnetometer"]
-    matrix = symmetric(vector(p, "CAL_MAG0_?SCALE"), vector(p, "CAL_MAG0_?ODIAG"))
-    assert same((gauss - vector(p, "CAL_MAG0_?OFF")) @ matrix.T, 1e4 * magnetometer.apply(RAW["magnetometer"]))
-
-
-@pytest.mark.parametrize("temperature", [AT, WARM])
-def test_ardupilot(temperature: float) -> None:
-    accelerometer = replace(triad("accelerometer", warm=True), scale_per_degc=np.zeros((3, 3)))
-    gyroscope = replace(triad("gyroscope", warm=True, unit_scale=True), scale_per_degc=np.zeros((3, 3)))
-    magnetometer = triad("magnetometer", soft_iron=True)
-    all_three = constants(accelerometer=accelerometer, gyroscope=gyroscope, magnetometer=magnetometer)
-    export = FORMATS["ardupilot"](all_three)
-    p = {k: float(v) for k, v in (r.split(",") for r in export.text.splitlines() if not r.startswith("#"))}
-
-    def thermal(short: str) -> np.ndarray:
-        c = np.array([vector(p, f"INS_TCAL1_{short}{order}_?") for order in (1, 2, 3)])
-        low, high = p["INS_TCAL1_TMIN"], p["INS_TCAL1_TMAX"]
-        inside = [np.clip(t, low, high) for t in (temperature, p[f"INS_{short}1_CALTEMP"])]
-        polynomial = [np.array([t - 35.0, (t - 35.0) ** 2, (t - 35.0) ** 3]) @ c * 1e-6 for t in inside]
-        return polynomial[0] - polynomial[1]
-
-    at = np.full(200, temperature)
-    found = (RAW["accelerometer"] - thermal("ACC") - vector(p, "INS_ACCOFFS_?")) * vector(p, "INS_ACCSCAL_?")
-    assert same(found, accelerometer.apply(RAW["accelerometer"], at))
-    found = RAW["gyroscope"] - thermal("GYR") - vector(p, "INS_GYROFFS_?")
-    assert same(found, gyroscope.apply(RAW["gyroscope"], at))
-    milligauss = 1e7 * RAW["magnetometer"]
-    matrix = symmetric(vector(p, "COMPASS_DIA_?"), vector(p, "COMPASS_ODI_?"))
-    assert same((milligauss + vector(p, "COMPASS_OFS_?")) @ matrix.T, 1e7 * magnetometer.apply(RAW["magnetometer"]))
 
 
 @pytest.mark.parametrize("form", ["ros", "json", "c"])
 def test_formats_that_hold_everything(form: str, tmp_path: Path) -> None:
     triads = {sensor: triad(sensor, soft_iron=True, warm=True) for sensor in SIZE}
-    export = FORMATS[form](constants(**triads))
-    assert export.warnings == ()
+    written = export(form, constants(**triads))
+    assert written.warnings == ()
     for sensor, raw in RAW.items():
         wanted = triads[sensor].apply(raw, np.full(200, WARM))
         if form == "c":
-            found = compiled(export.text, sensor, raw, tmp_path)
+            found = compiled(written.text, sensor, raw, tmp_path)
         else:
-            document = yaml.safe_load(export.text) if form == "ros" else json.loads(export.text)
+            document = yaml.safe_load(written.text) if form == "ros" else json.loads(written.text)
             if form == "ros":
                 document = {"sensors": document["/**"]["ros__parameters"]["fieldcal"]}
             t = document["sensors"][sensor]
@@ -163,52 +110,104 @@ def compiled(header: str, sensor: str, raw: np.ndarray, folder: Path) -> np.ndar
     return np.array([[float(v) for v in line.split()] for line in out.splitlines()])
 
 
-def test_kalibr_holds_the_matrix() -> None:
+def test_kalibr_reads_the_file_and_its_model_gives_the_readings() -> None:
+    """ImuParameters of kalibr_common/ConfigReader.py asks for these fields; the model is IccSensors.py's."""
     triads = {sensor: triad(sensor, soft_iron=True) for sensor in SIZE}
-    export = FORMATS["kalibr"](constants(**triads))
-    imu = yaml.safe_load(export.text)["imu0"]
-    assert imu["model"] == "scale-misalignment"
+    turned = np.eye(3) + np.array([[0.0, 0.02, -0.01], [-0.03, 0.0, 0.01], [0.02, 0.01, 0.0]])
+    triads = {sensor: replace(t, scale=t.scale @ turned) for sensor, t in triads.items()}
+    written = export("kalibr", replace(constants(**triads), imu_rate_hz=250.0))
+    imu = yaml.safe_load(written.text)
+    assert (imu["update_rate"], imu["rostopic"][0], imu["model"]) == (250.0, "/", "scale-misalignment")
+    for name in ("accelerometer", "gyroscope"):
+        assert imu[f"{name}_noise_density"] > 0.0
+        assert imu[f"{name}_random_walk"] > 0.0
+    assert isinstance(imu["time_offset"], float)
+    t_i_b, c_gyro_i = np.array(imu["T_i_b"]), np.array(imu["gyroscopes"]["C_gyro_i"])
+    for rotation in (t_i_b[:3, :3], c_gyro_i):
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(rotation) > 0.0
+    assert t_i_b[3].tolist() == [0.0, 0.0, 0.0, 1.0]
     for sensor, block in (("accelerometer", "accelerometers"), ("gyroscope", "gyroscopes")):
         m = np.array(imu[block]["M"])
+        assert not np.any(np.triu(m, 1))
+        z = triads[sensor].apply(RAW[sensor])
+        in_imu = z @ t_i_b[:3, :3].T
+        seen = in_imu if sensor == "accelerometer" else in_imu @ c_gyro_i.T
         bias = triads[sensor].zero  # what Kalibr would estimate by itself
-        found = np.linalg.solve(m, (RAW[sensor] - bias).T).T
-        assert same(found, triads[sensor].apply(RAW[sensor]))
-    assert np.array(imu["gyroscopes"]["C_gyro_i"]).tolist() == np.eye(3).tolist()
-    assert any("magnetometer" in warning for warning in export.warnings)
-    assert any("bias" in warning for warning in export.warnings)
+        assert same(seen @ m.T + bias, RAW[sensor])
+    assert not np.any(np.array(imu["gyroscopes"]["A"]))
+    assert any("magnetometer" in warning for warning in written.warnings)
+    assert any("bias" in warning for warning in written.warnings)
+    assert any("noise densities" in warning for warning in written.warnings)
+
+
+def test_imu_calibs_file_gives_what_apply_gives() -> None:
+    """AccelCalib::loadCalib and applyCalib of imu_calib: corrected = SM · raw − bias, SM row by row."""
+    t = triad("accelerometer", soft_iron=True)
+    written = export("imu_calib", constants(accelerometer=t, gyroscope=triad("gyroscope")))
+    node = yaml.safe_load(written.text)
+    assert (len(node["SM"]), len(node["bias"])) == (9, 3)
+    corrected = RAW["accelerometer"] @ np.array(node["SM"]).reshape(3, 3).T - np.array(node["bias"])
+    assert same(corrected, t.apply(RAW["accelerometer"]))
+    assert any(told.startswith("gyroscope: imu_calib measures its zero itself") for told in written.warnings)
+    for other in ({"gyroscope": triad("gyroscope")}, {"accelerometer": replace(t, logged_unit="counts")}):
+        with pytest.raises(FieldcalError, match="imu_calib corrects an accelerometer in m/s²") as caught:
+            export("imu_calib", constants(**other))
+        assert caught.value.reason_code == "not_loadable"
+
+
+def test_imu_pipelines_transform_is_how_the_sensor_is_mounted() -> None:
+    turn = Rotation.from_euler("ZYX", [40.0, 20.0, -10.0], degrees=True)
+    rows = tuple(map(tuple, turn.as_matrix()))
+    c = constants(gyroscope=triad("gyroscope"))
+    written = export("imu_pipeline", replace(c, origins={"gyroscope": Origin(rotation_body_from_sensor=rows)}))
+    document = yaml.safe_load(written.text)
+    sent = document["static_transform_publisher"]["ros__parameters"]
+    found = Rotation.from_quat([sent[f"rotation.{axis}"] for axis in "xyzw"])
+    assert (found * turn.inv()).magnitude() < 1e-12
+    assert sent["frame_id"] == document["imu_transformer"]["ros__parameters"]["target_frame"]
+    with pytest.raises(FieldcalError, match="is not known; run a night"):
+        export("imu_pipeline", c)
 
 
 @pytest.mark.parametrize("form", ["px4", "ardupilot"])
 def test_what_an_autopilot_cannot_hold_is_told(form: str) -> None:
     counts = replace(triad("accelerometer"), logged_unit="counts")
     mirrored = replace(triad("magnetometer"), scale=np.diag([1.0, -1.0, 1.0]))
-    export = FORMATS[form](constants(accelerometer=counts, magnetometer=mirrored, gyroscope=triad("gyroscope")))
-    assert not any(name in export.text for name in ("ACC", "MAG", "COMPASS"))
-    told = " ".join(export.warnings)
+    written = export(form, constants(accelerometer=counts, magnetometer=mirrored, gyroscope=triad("gyroscope")))
+    assert not any(name in written.text for name in ("ACC", "MAG", "COMPASS"))
+    told = " ".join(written.warnings)
     for part in ("in counts", "negative scale", "no gyroscope scale"):
         assert part in told
-    warm = constants(accelerometer=triad("accelerometer", warm=True), magnetometer=triad("magnetometer", warm=True))
-    told = " ".join(FORMATS[form](warm).warnings)
-    for part in ("no slope of the scale on temperature", "does not correct it for temperature"):
-        assert part in told
+    told = " ".join(export(form, constants(accelerometer=triad("accelerometer", warm=True))).warnings)
+    assert "no slope of the scale on temperature" in told
     cross = constants(
         accelerometer=triad("accelerometer", soft_iron=True),
         magnetometer=replace(triad("magnetometer"), scale=np.eye(3) + np.diag([0.1, 0.0], k=1)),
     )
-    told = " ".join(FORMATS[form](cross).warnings)
+    told = " ".join(export(form, cross).warnings)
     for part in ("no cross-axis terms", "symmetric matrix"):
         assert part in told
 
 
+@pytest.mark.parametrize("form", ["px4", "ardupilot"])
+def test_counts_are_refused_and_make_no_file_of_comments(form: str) -> None:
+    counts = {sensor: replace(triad(sensor), logged_unit="counts") for sensor in SIZE}
+    with pytest.raises(FieldcalError, match=r"Nothing to load .* are in counts") as caught:
+        export(form, constants(**counts))
+    assert caught.value.reason_code == "not_loadable"
+
+
 def test_a_narrow_temperature_range_is_not_for_ardupilot() -> None:
     narrow = replace(triad("accelerometer", warm=True), flown_degc=(17.0, 24.0))
-    export = FORMATS["ardupilot"](constants(accelerometer=narrow))
-    assert "TCAL" not in export.text
-    assert any("10 °C" in warning for warning in export.warnings)
+    written = export("ardupilot", constants(accelerometer=narrow))
+    assert "TCAL" not in written.text
+    assert any("10 °C" in warning for warning in written.warnings)
 
 
 def test_ids_cannot_break_out_of_a_comment() -> None:
     """The id has a line break and the end of a C comment in it."""
-    for form, write in FORMATS.items():
-        text = write(constants(gyroscope=triad("gyroscope"))).text
+    c = constants(gyroscope=triad("gyroscope"), accelerometer=triad("accelerometer"))
+    for form in FORMATS:
+        text = export(form, replace(c, origins={"gyroscope": Origin(), "accelerometer": Origin()})).text
         assert "\n1*/" not in text, form

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from fieldcal.exports import FORMATS
+from fieldcal.exports import AUTOPILOTS, PROGRAMS
+from fieldcal.exports.autopilots.loading import Request
 from fieldcal.exports.calibration import Constants, Triad
 from fieldcal.names import Sensor
 
@@ -38,15 +39,15 @@ def constants(as_of: str = "", vehicle_id: str = "v", **changes: object) -> Cons
 
 def test_numbers_of_yaml_are_numbers() -> None:
     """YAML 1.1 takes 1e-05 for text and 1.0e-05 for a number."""
-    written = yaml.safe_load(FORMATS["ros"](constants()).text)["/**"]["ros__parameters"]["fieldcal"]["gyroscope"]
+    written = yaml.safe_load(PROGRAMS["ros"](constants()).text)["/**"]["ros__parameters"]["fieldcal"]["gyroscope"]
     assert written["zero"] == [1e-5, 2e22, -3.5]
     assert written["scale"] == np.diag([0.25, 1e-5, 1.5e-5]).ravel().tolist()
     assert all(np.isnan(v) for v in written["scale_sd"])
 
 
 def test_kalibr_gets_matrices_of_its_sizes() -> None:
-    """imu0 of kalibr's calibration-yaml: T_i_b is 4 × 4, A and C_gyro_i are 3 × 3."""
-    imu = yaml.safe_load(FORMATS["kalibr"](constants()).text)["imu0"]
+    """An IMU of Kalibr: T_i_b is 4 × 4, A and C_gyro_i are 3 × 3."""
+    imu = yaml.safe_load(PROGRAMS["kalibr"](constants()).text)
     assert imu["T_i_b"] == np.eye(4).tolist()
     assert imu["gyroscopes"]["A"] == np.zeros((3, 3)).tolist()
     assert imu["gyroscopes"]["C_gyro_i"] == np.eye(3).tolist()
@@ -62,28 +63,31 @@ def test_kalibr_gets_matrices_of_its_sizes() -> None:
 )
 def test_kalibr_is_told_of_temperature_when_there_is_some(changes: dict[str, np.ndarray], told: bool) -> None:
     assert (
-        any("knows no temperature" in warning for warning in FORMATS["kalibr"](constants(**changes)).warnings) == told
+        any("knows no temperature" in warning for warning in PROGRAMS["kalibr"](constants(**changes)).warnings) == told
     )
 
 
 @pytest.mark.parametrize("as_of", ["", "2026-05-04T12:00:00+00:00"])
 def test_when_is_said_or_said_to_be_unknown(as_of: str) -> None:
-    for form in ("c", "px4", "ardupilot", "kalibr"):
-        assert f"as of {as_of or 'unknown'}" in FORMATS[form](constants(as_of)).text, form
-    assert json.loads(FORMATS["json"](constants(as_of)).text)["as_of"] == (as_of or None)
+    for form in ("c", "kalibr"):
+        assert f"as of {as_of or 'unknown'}" in PROGRAMS[form](constants(as_of)).text, form
+    for form, write in AUTOPILOTS.items():
+        text = write(constants(as_of, logged_unit="rad/s"), Request(logged_raw=True)).text
+        assert f"as of {as_of or 'unknown'}" in text, form
+    assert json.loads(PROGRAMS["json"](constants(as_of)).text)["as_of"] == (as_of or None)
 
 
 def test_ids_beyond_ascii() -> None:
     """JSON holds them as they are; C source is plain ASCII."""
     c = constants(vehicle_id="Möwe")
-    assert '"Möwe"' in FORMATS["json"](c).text
-    assert FORMATS["c"](c).text.isascii()
+    assert '"Möwe"' in PROGRAMS["json"](c).text
+    assert PROGRAMS["c"](c).text.isascii()
 
 
 def test_json_has_no_nan() -> None:
-    assert json.loads(FORMATS["json"](constants()).text)["sensors"]["gyroscope"]["scale_sd"] == [None] * 3
+    assert json.loads(PROGRAMS["json"](constants()).text)["sensors"]["gyroscope"]["scale_sd"] == [None] * 3
     with pytest.raises(ValueError, match="not JSON compliant"):
-        FORMATS["json"](constants(temperature_degc=np.nan))
+        PROGRAMS["json"](constants(temperature_degc=np.nan))
 
 
 def test_a_zero_without_bends_is_a_line_over_temperature() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from fieldcal.exports import FORMATS
+from fieldcal.exports import PROGRAMS
 from fieldcal.exports.calibration_at import constants_of
 from fieldcal.flows.run import run_night
 from fieldcal.names import SENSORS
@@ -96,7 +96,7 @@ def test_the_history_holds_the_rows_of_the_methods_that_were_chosen(
 def test_export_and_report_follow(night: tuple[Path, Path, dict[str, Any]], number: int) -> None:
     _, root, _ = night
     vehicle = f"sim-{number}"
-    exported = json.loads(FORMATS["json"](constants_of(root, vehicle)).text)["sensors"]
+    exported = json.loads(PROGRAMS["json"](constants_of(root, vehicle)).text)["sensors"]
     rows = Warehouse(root).sql(
         "SELECT * FROM latest_calibration WHERE vehicle_id = ? AND parameter = 'scale' AND length(axis) = 1", [vehicle]
     )

@@ -131,7 +131,9 @@ def px4(path: Path) -> dict[str, list[str]]:
             }
             if sensor != "magnetometer" or k < MAGNETOMETERS:
                 topics.append(Rows(topic, columns, k))
-    write_ulog(path, topics, parameters={}, infos={"sys_name": "PX4", "ver_hw": "BOARD", "sys_uuid": "0042"})
+    ids_of_slots = {f"CAL_{short}{k}_ID": 202 - k for short in ("GYRO", "ACC") for k in range(IMUS)}
+    ids_of_slots |= {f"CAL_MAG{k}_ID": 301 - k for k in range(MAGNETOMETERS)}
+    write_ulog(path, topics, parameters=ids_of_slots, infos={"sys_name": "PX4", "ver_hw": "BOARD", "sys_uuid": "0042"})
     return ids([f"0042/{200 + k}" for k in range(IMUS)], [f"0042/{300 + k}" for k in range(MAGNETOMETERS)])
 
 
@@ -254,6 +256,29 @@ def test_a_flight_is_exported_by_its_primary_units_or_by_the_one_that_is_named(n
             np.testing.assert_allclose(np.diagonal(constants.triads[sensor].scale), truth, rtol=LARGEST_SHARE)
     with pytest.raises(fieldcal.FieldcalError, match=f"of unit 'none'; there is: .*{night.ids['gyroscope'][0]}"):
         night.warehouse.calibration_at("v", unit="none")
+
+
+@pytest.mark.parametrize("night", ["bin", "ulg"], indirect=True)
+def test_every_unit_is_exported_into_the_slot_of_its_device(night: Night) -> None:
+    """Of PX4 the slots are numbered against the order of the units."""
+    to = {"bin": "ardupilot", "ulg": "px4"}[night.kind]
+    export = fieldcal.export(night.warehouse.calibration_at("v"), to)
+    lines = [line for line in export.text.splitlines() if not line.startswith("#")]
+    rows = [line.split("\t")[2:4] if to == "px4" else line.split(",") for line in lines]
+    assert len({name for name, _ in rows}) == len(rows)
+    p = {name: float(value) for name, value in rows}
+    for place in range(IMUS):
+        number = "" if place == 0 else str(place + 1)
+        names = {"gyroscope": f"INS_GYR{number}OFFS_?", "accelerometer": f"INS_ACC{number}OFFS_?"}
+        if to == "px4":
+            slot = IMUS - 1 - place
+            names = {"gyroscope": f"CAL_GYRO{slot}_?OFF", "accelerometer": f"CAL_ACC{slot}_?OFF"}
+        for sensor, name in names.items():
+            found = np.array([p[name.replace("?", axis)] for axis in "XYZ"])
+            np.testing.assert_allclose(found, night.truth(sensor, place, "zero"), rtol=0, atol=LARGEST_SHARE)
+    left_out = [told for told in export.warnings if "left out" in told]
+    assert len(left_out) == MAGNETOMETERS
+    assert all(told.startswith("magnetometer") and "in norm" in told for told in left_out)
 
 
 @pytest.mark.parametrize("night", ["bin"], indirect=True)

@@ -3,6 +3,7 @@ readings an autopilot's own formula turns into logged ones."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from fieldcal.logs.ulog.write import Rows, write_ulog
 from fieldcal.names import SENSORS, Method, Sensor
 from fieldcal.simulation.experiment import simulate
 from fieldcal.stages.composition import compose, in_log
-from fieldcal.stages.results import triad_rows
+from fieldcal.stages.results import ZERO_SLOPE, triad_rows, zero_slope_rows
 from fieldcal.stages.tables import AXES, calibration_rows, constants
 
 LAMBDA = {"gyroscope": (1.02, 0.985, 1.01), "accelerometer": (1.01, 0.99, 1.02), "magnetometer": (1.05, 0.95, 1.1)}
@@ -40,6 +41,13 @@ def settings(matrix: np.ndarray, offset: np.ndarray, *, known: bool = True) -> C
         applied_matrix_sd={**own, Sensor.GYROSCOPE: 0.0},
         applied_offset_sd={**own, Sensor.GYROSCOPE: (0.0, 0.0, 0.0)},
         own_sensors=SENSORS,
+        body="frd",
+        applied_offset_per_degc=dict.fromkeys(SENSORS),
+        gravity_sign="specific_force",
+        field_ned=(0.2, 0.0, 0.45),
+        field_unit="G",
+        rotation_body_from_sensor=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        loaded=dict.fromkeys(SENSORS),
     )
 
 
@@ -85,6 +93,19 @@ def test_the_sd_is_that_of_the_found_constants_in_raw_units() -> None:
     assert [rows["scale", a]["sd"] for a in AXES] == pytest.approx([2e-3, 5e-4, 1e-3])
     assert [rows["zero", a]["value"] for a in AXES] == pytest.approx([-0.05, -0.4, -0.3])
     assert [rows["zero", a]["sd"] for a in AXES] == pytest.approx([5e-5, 2e-4, 1e-4])
+
+
+def test_a_slope_within_the_flight_has_that_of_the_compensation_beside_it() -> None:
+    """logged = P raw + o(T): what a compensated reading still follows of the temperature is not all of it."""
+    p, o_per_degc, slope = np.diag([2.0, 0.5, 1.0]), np.array([-2e-4, 3e-4, 0.0]), np.array([1e-5, 0.0, 2e-5])
+    own = settings(p, np.array([0.1, 0.2, 0.3]))
+    own = replace(own, applied_offset_per_degc={**own.applied_offset_per_degc, Sensor.GYROSCOPE: tuple(o_per_degc)})  # type: ignore[dict-item]
+    rows = zero_slope_rows(
+        Sensor.GYROSCOPE, Method.WARM_UP, slope, np.full(3, 1e-6), logged_unit="rad/s", temperature_degc=25.0
+    )
+    found = compose({"warm_up": calibration_rows(rows)}, own).tables["calibration"].filter(parameter=ZERO_SLOPE)
+    np.testing.assert_allclose(found["value"].to_numpy(), (slope - o_per_degc) / np.diagonal(p))
+    np.testing.assert_allclose(found["sd"].to_numpy(), 1e-6 / np.diagonal(p))
 
 
 def test_what_is_raw_or_only_turned_stays_as_it_is() -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from fieldcal.logs.dataflash.records import Rows
 from fieldcal.names import Triple
+
+AUTOPILOT: Final = "ardupilot"
 
 
 class Parameters:
@@ -67,6 +70,10 @@ class Parameters:
         """Of these parameters those that the log has, as they are at `at_ns`."""
         return {name: self.value(name, at_ns) for name in names if name in self}
 
+    def last(self, names: Iterable[str]) -> dict[str, float]:
+        """Of these parameters those that the log has, as they are at its end."""
+        return {name: self._history[name][-1][1] for name in names if name in self}
+
 
 Triad = tuple[str, str, str]
 """Names of the parameters of three axes."""
@@ -95,6 +102,10 @@ class InertialNames:
         limits = (self.calibrated_degc, self.thermal_enable, self.thermal_min_degc, self.thermal_max_degc)
         return (*self.offset, *(self.scale or ()), *limits, *coefficients)
 
+    def loaded(self) -> tuple[str, ...]:
+        """Every parameter that tells what is calibrated for the sensor, and whether it stays so."""
+        return (self.device_id, self.use, *self.all(), *(("INS_GYR_CAL",) if self.scale is None else ()))
+
 
 def inertial_names(kind: str, slot: int) -> InertialNames:
     """Names of slot 0, 1, … of `kind`, "GYR" or "ACC". From the fourth slot on they are named by another rule."""
@@ -121,7 +132,9 @@ def inertial_names(kind: str, slot: int) -> InertialNames:
 
 @dataclass(frozen=True)
 class CompassNames:
-    """Parameters of the magnetometer in one slot. `orientation` counts where `external` is not 0, else the board's."""
+    """Parameters of the magnetometer in one slot. `orientation` counts where `external` is not 0, else the board's.
+
+    `motor`: what is added to it by current or throttle, as COMPASS_MOTCT says."""
 
     device_id: str
     use: str
@@ -131,10 +144,15 @@ class CompassNames:
     scale: str
     orientation: str
     external: str
+    motor: Triad
 
     def all(self) -> tuple[str, ...]:
         """Every parameter that a correction depends on."""
         return (*self.offset, *self.diagonal, *self.off_diagonal, self.scale, self.orientation, self.external)
+
+    def loaded(self) -> tuple[str, ...]:
+        """Every parameter that tells what is calibrated for the sensor, and whether it stays so."""
+        return (self.device_id, self.use, *self.all(), *self.motor, "COMPASS_MOTCT", "COMPASS_LEARN")
 
 
 def compass_names(slot: int) -> CompassNames:
@@ -149,6 +167,7 @@ def compass_names(slot: int) -> CompassNames:
         f"COMPASS_SCALE{number}",
         f"COMPASS_ORIENT{number}",
         "COMPASS_EXTERNAL" if slot == 0 else f"COMPASS_EXTERN{number}",
+        triad(f"COMPASS_MOT{number}"),
     )
 
 

@@ -10,7 +10,7 @@ from fieldcal.logs.autopilot import Joined, join_on_gyroscope, unit_ids
 from fieldcal.logs.dataflash import signals
 from fieldcal.logs.dataflash.applied import Temperatures, inertial_corrections, magnetometer_corrections
 from fieldcal.logs.dataflash.file import DataflashFile
-from fieldcal.logs.dataflash.parameters import Parameters, compass_names, inertial_names
+from fieldcal.logs.dataflash.parameters import AUTOPILOT, Parameters, compass_names, inertial_names
 from fieldcal.logs.dataflash.signals import ACCELEROMETER, GYROSCOPE, MAGNETOMETER, OFFSETS, Stream
 from fieldcal.logs.interface import LogSummary, SensorSource
 from fieldcal.names import Sensor
@@ -113,6 +113,8 @@ def imu_sources(
                     unit.filtered,
                     ids[kind][number],
                     tuple(replace(one, from_ns=one.from_ns + shift_ns) for one in corrections),
+                    AUTOPILOT,
+                    parameters.last(_of_both(unit.slow.instance)),
                 )
             )
     return found
@@ -144,9 +146,16 @@ def magnetometer_sources(
                 False,
                 ids[number],
                 tuple(replace(one, from_ns=one.from_ns + shift_ns) for one in corrections),
+                AUTOPILOT,
+                parameters.last(compass_names(stream.instance).loaded()),
             )
         )
     return sources
+
+
+def _of_both(slot: int) -> list[str]:
+    """Parameters of gyroscope and accelerometer: a thermal compensation is enabled for both."""
+    return [name for kind, _ in PARTS for name in inertial_names(kind, slot).loaded()]
 
 
 def _better(fast: Stream, slow: Stream) -> bool:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +22,18 @@ from fieldcal.logs.ulog.file import Change
 from fieldcal.logs.ulog.rotations import CUSTOM, from_euler, rotation
 from fieldcal.names import Sensor
 
+AUTOPILOT: Final = "px4"
 SLOTS = 4
 AXES = "XYZ"
 CALIBRATION = {Sensor.GYROSCOPE: "CAL_GYRO", Sensor.ACCELEROMETER: "CAL_ACC", Sensor.MAGNETOMETER: "CAL_MAG"}
 THERMAL = {Sensor.GYROSCOPE: "TC_G", Sensor.ACCELEROMETER: "TC_A", Sensor.MAGNETOMETER: "TC_M"}
 BOARD = "SENS_BOARD_"
+BY_ITSELF = {
+    Sensor.GYROSCOPE: ("IMU_GYRO_CAL_EN", "SENS_IMU_AUTOCAL"),
+    Sensor.ACCELEROMETER: ("SENS_IMU_AUTOCAL",),
+    Sensor.MAGNETOMETER: ("SENS_MAG_AUTOCAL",),
+}
+"""Where one of these is not 0, PX4 changes a sensor's offsets by itself: at rest, or after a flight."""
 _DEGREES = 4
 _ID_MASK = 0xFFFFFFFF
 
@@ -43,6 +51,11 @@ class History:
     changes: Sequence[Change] = ()
     start_us: int = 0
     release: int | None = None
+
+    @property
+    def last(self) -> Mapping[str, float]:
+        """All values as they stand at the end of the log."""
+        return {**self.initial, **{change.name: change.value for change in self.changes}}
 
     def states(self, *prefixes: str) -> Iterator[tuple[int, Mapping[str, float]]]:
         """(from when, in µs, all values): at the start, and whenever a parameter with one of these prefixes was set."""
@@ -143,6 +156,16 @@ def correction(
     matrix = turn @ scale
     offset, per_degc = -matrix @ (thermal + zero), -matrix @ slope
     return Correction(from_ns, _rows(matrix), _triple(offset), {**get.used}, reference, _triple(per_degc))
+
+
+def parameters_of(sensor: Sensor, device_id: int | None, values: Mapping[str, float]) -> dict[str, float]:
+    """Of the autopilot's parameters those that concern a sensor: its slot's, which devices the other slots are for,
+    what mounts it, and what may change its calibration by itself."""
+    calibration, thermal = CALIBRATION[sensor], THERMAL[sensor]
+    beside = [f"{prefix}{slot}_ID" for prefix in (calibration, thermal) for slot in range(SLOTS)]
+    beside += [f"{thermal}_ENABLE", *BY_ITSELF[sensor]]
+    used = correction(sensor, device_id, values).parameters
+    return {**used, **{name: values[name] for name in beside if np.isfinite(values.get(name, np.nan))}}
 
 
 def corrected(piece: Correction, raw: Vector, temperature_degc: float | None = None) -> Vector:

@@ -17,7 +17,7 @@ from fieldcal.logs.interface import Batch, Columns, Correction, LogSummary, Sens
 from fieldcal.logs.joining import imu_columns, triad
 from fieldcal.logs.ulog import aids
 from fieldcal.logs.ulog.file import UlogFile
-from fieldcal.logs.ulog.parameters import BOARD, History, corrections
+from fieldcal.logs.ulog.parameters import AUTOPILOT, BOARD, History, corrections, parameters_of
 from fieldcal.logs.ulog.report import report, tell_selection
 from fieldcal.logs.ulog.streams import (
     Clock,
@@ -153,6 +153,8 @@ class UlogLog:
                 averages,
                 device_id or None,
                 done,
+                AUTOPILOT,
+                parameters_of(sensor, device_id or None, self._history.last),
             )
         )
 

@@ -1,0 +1,149 @@
+"""What the history tells of the flights behind constants: whose parameters, which axes, which units beside."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from history_rows import lead, rows
+
+import fieldcal
+from fieldcal.cli.main import run
+from fieldcal.exports.calibration_at import constants_of
+from fieldcal.names import Sensor
+from fieldcal.report import write_vehicle_report
+from fieldcal.warehouse.publish import publish
+
+PARAMETERS = {"CAL_GYRO0_ID": 11.0, "CAL_GYRO1_ID": 12.0, "CAL_GYRO0_XOFF": 0.02, "CAL_GYRO1_XOFF": 0.5}
+NOT_TURNED = np.eye(3).tolist()
+
+
+def gyroscope(first: dict[str, Any], value: float, status: str = "ok") -> list[dict[str, Any]]:
+    """Scale 1.01 and a zero, ± 1 mrad/s, of one flight at 31 °C."""
+    common = {
+        **first,
+        "sensor": "gyroscope",
+        "method": "joint",
+        "status": status,
+        "temperature_degc": 31.0,
+        "sd": 1e-3,
+    }
+    return [
+        {**common, "parameter": parameter, "axis": axis, "unit": unit, "value": number}
+        for parameter, unit, number in (("scale", "1", 1.01), ("zero", "rad/s", value))
+        for axis in "xyz"
+    ]
+
+
+def origin(device_id: int | None, **changes: Any) -> dict[str, Any]:
+    loaded = {"autopilot": "px4", "device_id": device_id, "rotation": NOT_TURNED, "parameters": PARAMETERS}
+    return {
+        "body": "frd",
+        "gravity_sign": "specific_force",
+        "rotation_body_from_sensor": NOT_TURNED,
+        "horizontal_field_g": None,
+        "loaded": {} if device_id is None else {"gyroscope": loaded},
+        **changes,
+    }
+
+
+def composition(first: dict[str, Any], told: dict[str, Any] | None) -> dict[str, Any]:
+    measured = {} if told is None else {"origin": told}
+    return {**first, "stage": "composition", "status": "ok", "measured": json.dumps(measured), "run_key": "k" * 32}
+
+
+def history(root: Path, *flights: tuple[list[dict[str, Any]], list[dict[str, Any]]]) -> Path:
+    for constants, runs in flights:
+        tables = {
+            "calibration": rows("calibration", *constants),
+            "run": rows("run", *runs),
+            "flight": rows("flight", {**runs[0], "log_uri": "x", "verdict": "ok", "imu_rate_hz": 187.0}),
+        }
+        publish(root, "v", tables, [runs[0]["flight_id"]])
+    return root
+
+
+def two_units(root: Path) -> Path:
+    """An old flight with another unit; a flight with two, the primary one in the second slot."""
+    old = lead("v", "f0", 0) | {"unit_id": "b/10"}
+    primary = lead("v", "f1", 1) | {"unit_id": "b/12"}
+    other = lead("v", "f1", 1) | {"unit_id": "b/11", "is_primary": False}
+    return history(
+        root,
+        (gyroscope(old, 0.9), [composition(old, origin(10))]),
+        (
+            gyroscope(primary, 0.03) + gyroscope(other, 0.04),
+            [composition(primary, origin(12)), composition(other, origin(11))],
+        ),
+    )
+
+
+def test_constants_know_what_was_loaded_and_which_units_flew_beside(tmp_path: Path) -> None:
+    constants = constants_of(two_units(tmp_path), "v")
+    assert constants.unit_ids == {"gyroscope": "b/12"}
+    assert constants.imu_rate_hz == 187.0
+    own = constants.origins[Sensor.GYROSCOPE]
+    assert own.loaded is not None
+    assert (own.loaded.autopilot, own.loaded.device_id, own.loaded.parameters) == ("px4", 12, PARAMETERS)
+    assert own.temperature_degc == 31.0
+    (beside,) = constants.further
+    assert beside.unit_ids == {"gyroscope": "b/11"}
+    loaded = beside.origins[Sensor.GYROSCOPE].loaded
+    assert loaded is not None
+    assert loaded.device_id == 11
+    text = fieldcal.export(constants, "px4").text
+    assert "CAL_GYRO1_XOFF\t0.03\t" in text
+    assert "CAL_GYRO0_XOFF\t0.04\t" in text
+
+
+def test_one_unit_that_is_asked_for_comes_alone(tmp_path: Path) -> None:
+    constants = constants_of(two_units(tmp_path), "v", unit_id="b/11")
+    assert constants.further == ()
+    assert "CAL_GYRO1" not in fieldcal.export(constants, "px4").text
+
+
+def test_a_history_of_before_tells_nothing(tmp_path: Path) -> None:
+    first = lead("v", "f1", 1)
+    root = history(tmp_path, (gyroscope(first, 0.1), [composition(first, None)]))
+    assert constants_of(root, "v").origins == {}
+
+
+def test_axes_and_sign_are_those_of_the_flight(tmp_path: Path) -> None:
+    first = lead("v", "f1", 1)
+    told = origin(None, body="flu", gravity_sign="gravity", horizontal_field_g=0.2)
+    root = history(tmp_path, (gyroscope(first, 0.1), [composition(first, told)]))
+    own = constants_of(root, "v").origins[Sensor.GYROSCOPE]
+    assert (own.loaded, own.body, own.gravity_sign, own.horizontal_field_g) == (None, "flu", "gravity", 0.2)
+
+
+def test_compare_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = two_units(tmp_path / "w")
+    capsys.readouterr()
+    assert run(["compare", "v", "--json", "--warehouse", str(root)]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [(r["unit_id"], r["axis"], r["parameter"]) for r in found[:2]] == [
+        ("b/12", "x", "zero"),
+        ("b/12", "x", "scale"),
+    ]
+    x = found[0]
+    assert (x["name"], x["flies_with"], x["estimate"], x["sd"]) == ("CAL_GYRO1_XOFF", 0.5, 0.03, 1e-3)
+    assert x["effect"] == pytest.approx(np.rad2deg(0.47) * 60.0)
+    assert run(["compare", "v", "--warehouse", str(root)]) == 0
+    shown = capsys.readouterr().out
+    assert "CAL_GYRO1_XOFF" in shown
+    now = tmp_path / "now.param"
+    now.write_text("CAL_GYRO1_ID,12\nCAL_GYRO1_XOFF,0.03\nCAL_GYRO0_ID,11\n")
+    assert run(["compare", "v", "--json", "--params", str(now), "--warehouse", str(root)]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["matters"] is False
+
+
+def test_the_vehicles_page_shows_the_same_table(tmp_path: Path) -> None:
+    page = write_vehicle_report(two_units(tmp_path), "v").read_text()
+    assert "What the autopilot flew with" in page
+    assert "CAL_GYRO1_XOFF" in page
+    first = lead("v", "f1", 1)
+    plain = history(tmp_path / "other", (gyroscope(first, 0.1), [composition(first, origin(None))]))
+    assert "What the autopilot flew with" not in write_vehicle_report(plain, "v").read_text()
