@@ -25,7 +25,7 @@ from fieldcal.schemas.rows import UNIT_OF_OLDER_ROWS
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.layout import history_files, vehicle_of
 from fieldcal.warehouse.store import by_absent_columns, frame
-from fieldcal.warehouse.view_text import view_text
+from fieldcal.warehouse.views import view_text
 
 # In the order in which they are made: later ones may need earlier ones.
 VIEWS = ("latest_calibration", "history", "drift_by_temperature", "worst_tic", "refusals", "calibration_at")
