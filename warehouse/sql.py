@@ -27,6 +27,7 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import HISTORY_TABLES
 from fieldcal.schemas.columns import IS_PRIMARY, UNIT_ID
 from fieldcal.schemas.rows import UNIT_OF_OLDER_ROWS
+from fieldcal.warehouse.checksums import assure
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.layout import history_files, vehicle_of
 from fieldcal.warehouse.store import by_absent_columns, frame
@@ -112,6 +113,7 @@ def _made(root: Path, query: str, views: Mapping[str, str]) -> dict[str, object]
     """Statements that make the tables and views that a query may name, and the files that it may open."""
     needed = "".join([query.lower(), *views.values()]) if len(views) < len(VIEWS) else "".join(HISTORY_TABLES)
     paths = {table: history_files(root, table) for table in HISTORY_TABLES if table in needed}
+    assure(root, [path for own in paths.values() for path in own])
     tables = [_table_view(table, own) if own else _empty_table(table) for table, own in paths.items()]
     return {"made": [*tables, *views.values()], "paths": _listed([path for own in paths.values() for path in own])}
 
