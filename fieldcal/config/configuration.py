@@ -236,9 +236,9 @@ class Alerts(Table):
 class Limits(Table):
     """What one log may take of the machine in a night, reading and all stages together. Results do not depend on it."""
 
-    seconds: Annotated[Positive, _meaning("time after which the work on a log is ended", "s")] = 3600.0
-    cpu_seconds: Annotated[Positive, _meaning("time of the processor after which it is ended", "s")] = 1800.0
-    memory_mb: Annotated[Positive, _meaning("memory of its process beyond which it is ended", "MB")] = 4096.0
+    seconds: Annotated[Positive, _meaning("time after which the work on a log is ended", "s")] = 7200.0
+    cpu_seconds: Annotated[Positive, _meaning("time of the processor after which it is ended", "s")] = 3600.0
+    memory_mb: Annotated[Positive, _meaning("memory of its process beyond which it is ended", "MB")] = 8192.0
 
 
 class Document(Table):
