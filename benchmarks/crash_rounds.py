@@ -23,7 +23,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 SEED = 17
 BEFORE, AFTER = "before", "after"
 
-# A night that ends itself, worker and all, when its n-th file gets its name. Counted, in a file that both append to, are
+# A night that ends itself, worker and all, when its n-th file gets its name. Counted, in a file of their own, are
 # stage records and history files. The worker runs this module too, but for its last lines.
 NIGHT = """
 import os, signal, sys

@@ -70,7 +70,8 @@ def problem(root: Path, path: Path, sha256: str | None) -> str | None:
 def assure(root: Path, paths: Iterable[Path]) -> None:
     """Make sure, before files are read, that each holds what was written: every byte, by its recorded sha256.
 
-    Where none is recorded, or the record itself is damaged, the file has only the checksums of its pages.
+    Where none is recorded, or the record itself is damaged, the file has only the checksums of its pages. One that is
+    absent holds nothing wrong: `verify` tells that it is missing.
 
     Raises
     ------
@@ -88,11 +89,13 @@ def assure(root: Path, paths: Iterable[Path]) -> None:
 
 
 def _as_recorded(root: Path, path: Path) -> bool:
+    if not path.exists():
+        return True
     try:
         allowed = recorded(root, path)
     except BrokenSeal:
         return True
-    return allowed is None or (file_sha256(path) if path.exists() else None) in allowed
+    return allowed is None or file_sha256(path) in allowed
 
 
 def history_digest(root: Path, tables: Iterable[str]) -> str:
