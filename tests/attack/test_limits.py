@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -75,6 +76,7 @@ def test_who_takes_more_than_its_limit_is_killed_and_the_reason_is_written(
         assert time.monotonic() - began < PATIENCE_S / 2
 
 
+@pytest.mark.skipif(shutil.which("ps") is None, reason="needs ps, as where there is no /proc")
 def test_ps_tells_what_proc_tells() -> None:
     cpu_s, held_mb = watchdog.taken(os.getpid())
     told_cpu_s, told_mb = watchdog._told_by_ps(os.getpid())
