@@ -23,20 +23,22 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 SEED = 17
 BEFORE, AFTER = "before", "after"
 
-# A night in a process that ends itself when its n-th file gets its name. Counted are stage records and history files.
+# A night that ends itself, worker and all, when its n-th file gets its name. Counted, in a file of their own, are
+# stage records and history files. The worker runs this module too, but for its last lines.
 NIGHT = """
 import os, signal, sys
 from pathlib import Path
 from fieldcal.warehouse import files
 
 archive, root, side, number = sys.argv[1:5]
-real, seen = files.AtomicFile.commit, 0
+real, counted = files.AtomicFile.commit, Path(root + ".counted")
 
 def commit(self):
-    global seen
     counts = self.path.name == "run.json" or "/tables/" in str(self.path)
-    seen += counts
-    last = counts and seen == int(number)
+    if counts:
+        with counted.open("ab") as stream:
+            stream.write(b".")
+    last = counts and counted.stat().st_size == int(number)
     if last and side == "before":
         os.killpg(0, signal.SIGKILL)
     sha256 = real(self)
@@ -45,16 +47,19 @@ def commit(self):
     return sha256
 
 files.AtomicFile.commit = commit
-from fieldcal.flows.run import run_night
-run_night(Path(archive), Path(root))
-print(seen)
+if __name__ == "__main__":
+    from fieldcal.flows.run import run_night
+    run_night(Path(archive), Path(root))
+    print(counted.stat().st_size)
 """
 
 
 def night(archive: Path, root: Path, side: str = BEFORE, number: int = 0) -> subprocess.Popen[str]:
     """A night that is killed at its `number`-th file; 0: never, and it prints how many there were."""
+    program = root.parent / "night.py"
+    program.write_text(NIGHT, encoding="utf-8")
     return subprocess.Popen(
-        [sys.executable, "-c", NIGHT, str(archive), str(root), side, str(number)],
+        [sys.executable, str(program), str(archive), str(root), side, str(number)],
         cwd=REPOSITORY,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

@@ -59,6 +59,8 @@ class ReasonCode(StrEnum):
     """Rows lie too far from the order of time."""
     TOO_SLOW = "too_slow"
     """Reading took longer than is allowed; the next night tries again."""
+    OVER_LIMITS = "over_limits"
+    """The work on it took more time or memory than a log may take."""
     RAGGED_ROWS = "ragged_rows"
     """Most rows have another number of fields than the header."""
     UNSUPPORTED_SCHEMA = "unsupported_schema"

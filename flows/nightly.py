@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import cast
 
@@ -12,7 +10,7 @@ from prefect import Flow, flow
 
 from fieldcal.batch.closing import close_night
 from fieldcal.batch.documents import Answer, Batch, NightDocument, PlainOutcome
-from fieldcal.batch.flights import flights, lost
+from fieldcal.batch.flights import lost
 from fieldcal.batch.night import Night, Watcher, plan_night, publishings
 from fieldcal.batch.outcome import Outcome
 from fieldcal.config.find import Source
@@ -21,7 +19,7 @@ from fieldcal.flows.alive import alive
 from fieldcal.flows.artifact import keep_artifact, tell_prefect
 from fieldcal.flows.farewell import tell_while_heard
 from fieldcal.flows.pool import hand_over, pool_answers
-from fieldcal.flows.processes import process_answers, spawned
+from fieldcal.flows.processes import Processes, process_answers
 from fieldcal.flows.runners import Answers, Parallel, batches, dask_answers
 from fieldcal.flows.tasks import publish_as_task, run_batch
 from fieldcal.provenance.run_key import code_digest
@@ -93,7 +91,7 @@ def flow_of(
     night: Night,
     parallel: Parallel,
     watcher: Watcher | None,
-    processes: ProcessPoolExecutor | None,
+    processes: Processes | None,
     keep: Callable[[NightDocument], None],
 ) -> Flow[..., NightDocument]:
     """The flow of a night that was planned already, while the server started; `processes` wait for its batches.
@@ -114,7 +112,7 @@ def carry_out(
     night: Night,
     parallel: Parallel,
     watcher: Watcher | None = None,
-    processes: ProcessPoolExecutor | None = None,
+    processes: Processes | None = None,
 ) -> NightDocument:
     """Run what the plan says, within a flow run; the JSON of the night."""
     tell_while_heard()
@@ -137,7 +135,7 @@ def carry_out(
 
 
 def _calibrate(
-    night: Night, parallel: Parallel, watcher: Watcher | None, processes: ProcessPoolExecutor | None
+    night: Night, parallel: Parallel, watcher: Watcher | None, processes: Processes | None
 ) -> Iterator[Outcome]:
     """Outcomes of the flights with something missing, batch by batch."""
     root, code = str(night.root), code_digest()
@@ -145,10 +143,6 @@ def _calibrate(
         {"number": n, "root": root, "source": night.source, "jobs": [job.plain() for job in jobs], "code": code}
         for n, jobs in enumerate(batches(night.missing(), parallel.workers))
     ]
-    if parallel.in_this_process(len(inputs)):
-        for given in inputs:
-            yield from _outcomes(run_batch(**given, watcher=watcher))
-        return
     for given, answer in _answers(parallel, inputs, processes):
         if isinstance(answer, Exception):
             say(f"Batch {given['number']} was lost ({type(answer).__name__}: {answer}); its logs follow one by one.")
@@ -159,12 +153,12 @@ def _calibrate(
             yield outcome
 
 
-def _answers(parallel: Parallel, inputs: list[Batch], processes: ProcessPoolExecutor | None) -> Answers:
+def _answers(parallel: Parallel, inputs: list[Batch], processes: Processes | None) -> Answers:
     if parallel.runner == "pool":
         return pool_answers(inputs)
     if parallel.runner == "dask":
         return dask_answers(parallel, run_batch, inputs)
-    return process_answers(parallel.workers, inputs, processes)
+    return process_answers(parallel.spawned(len(inputs)), inputs, processes)
 
 
 def _outcomes(answer: Answer) -> Iterator[Outcome]:
@@ -175,16 +169,14 @@ def _outcomes(answer: Answer) -> Iterator[Outcome]:
 
 
 def _one_by_one(given: Batch) -> Answer:
-    """The flights of a batch whose process died, each in a process of its own: only the guilty one is lost."""
+    """The flights of a batch whose process died, each a batch of its own: only the guilty one is lost."""
     outcomes: list[PlainOutcome] = []
-    for job in given["jobs"]:
-        with spawned(1) as alone:
-            try:
-                answer = alone.submit(flights, given["root"], given["source"], [job], given["code"]).result()
-            except BrokenProcessPool:
-                why = f"The process that calibrated {job['log_uri']} was killed, twice (out of memory?)."
-                outcomes.append(lost(job, why))
-                continue
+    for single, answer in process_answers(1, [{**given, "jobs": [job]} for job in given["jobs"]]):
+        if isinstance(answer, Exception):
+            (job,) = single["jobs"]
+            why = f"The process that calibrated {job['log_uri']} was killed, twice (out of memory?)."
+            outcomes.append(lost(job, why))
+            continue
         outcomes += answer["outcomes"]
         if answer["error"] is not None:
             return {"outcomes": outcomes, "error": answer["error"]}

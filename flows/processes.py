@@ -6,71 +6,106 @@ process tells Prefect's server of its tasks itself: through this one every event
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections import deque
+from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
 from importlib import import_module
 from multiprocessing import get_context
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 from fieldcal.batch.documents import Answer, Batch
 from fieldcal.batch.flights import flights
+from fieldcal.batch.limits import notes
 from fieldcal.flows.farewell import end_with_parent, tell_while_heard
 from fieldcal.flows.runners import Answers, answer_of
 
 LISTEN_S = 0.25
+TRIES = 2
+"""Of a batch whose process is killed by whom nobody knows."""
 Context = dict[str, Any]
 """As Prefect's own `serialize_context` gives it."""
 
 
-def spawned(workers: int) -> ProcessPoolExecutor:
-    """Processes that inherit nothing of this one, and end with it."""
-    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=end_with_parent)
+class Processes:
+    """Processes that inherit nothing of this one, and end with it; they import what a batch needs from the start.
+
+    Each is a pool of its own: one that is killed takes its own batch with it, and no other.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.free: list[ProcessPoolExecutor] = []
+        for _ in range(number):
+            self.add()
+
+    def add(self) -> None:
+        """Start one more."""
+        process = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=end_with_parent)
+        process.submit(_import)
+        self.free.append(process)
+
+    def release(self) -> None:
+        """Those that are free end; they still tell Prefect the rest while the night publishes."""
+        while self.free:
+            self.free.pop().shutdown(wait=False, cancel_futures=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.release()
 
 
-def spawned_ahead(workers: int) -> ProcessPoolExecutor:
-    """The same, already importing what a batch needs."""
-    pool = spawned(workers)
-    for _ in range(workers):
-        pool.submit(_import)
-    return pool
+@dataclass(frozen=True)
+class _Given:
+    """A batch, how often its process was killed, and which of its logs had been ended for their limits before."""
+
+    batch: Batch
+    killed: int = 0
+
+    def ended(self) -> frozenset[tuple[str, int]]:
+        return notes(Path(self.batch["root"]), [job["flight_id"] for job in self.batch["jobs"]])
 
 
-def process_answers(workers: int, inputs: Sequence[Batch], ahead: ProcessPoolExecutor | None = None) -> Answers:
-    """Run the batches; call it within the flow run that their tasks belong to.
+def process_answers(number: int, inputs: Sequence[Batch], ahead: Processes | None = None) -> Answers:
+    """Run the batches in so many processes; call it within the flow run that their tasks belong to.
 
-    A process that is killed takes all batches of its pool with it, not only its own, and there is no saying which that
-    was. They run in a second pool; those that were in it too when it broke come back as errors.
+    A batch whose process was ended because a log took more than its limits runs again: that log is rejected then. One
+    whose process was killed otherwise runs once more; killed again, it comes back as an error.
     """
     context = _context()
-    lost = yield from _answers(ahead or spawned(workers), context, inputs)
-    if lost:
-        lost = yield from _answers(spawned(workers), context, [given for given, _ in lost])
-    yield from lost
-
-
-def _answers(
-    pool: ProcessPoolExecutor, context: Context, inputs: Sequence[Batch]
-) -> Generator[tuple[Batch, Answer | Exception], None, list[tuple[Batch, Exception]]]:
-    """The answers of one pool; returns the batches that it lost because it broke."""
-    lost: list[tuple[Batch, Exception]] = []
-    with pool:
-        waiting: dict[Future[Answer], Batch] = {}
-        for given in inputs:
-            try:
-                waiting[pool.submit(_batch, context, given)] = given
-            except BrokenProcessPool as error:
-                lost.append((given, error))
-        while waiting:
-            # A wait without end would not hear Ctrl-C.
-            for future in wait(waiting, LISTEN_S, FIRST_COMPLETED).done:
-                given, answer = waiting.pop(future), answer_of(future)
-                if isinstance(answer, BrokenProcessPool):
-                    lost.append((given, answer))
-                else:
-                    yield given, answer
-        pool.shutdown(wait=False)  # they tell Prefect the rest while the night publishes
-    return lost
+    waiting = deque(_Given(batch) for batch in inputs)
+    busy: dict[Future[Answer], tuple[_Given, frozenset[tuple[str, int]], ProcessPoolExecutor]] = {}
+    with ahead or Processes(number) as processes:
+        try:
+            while waiting or busy:
+                while waiting and processes.free:
+                    process, given = processes.free.pop(), waiting[0]
+                    try:
+                        busy[process.submit(_batch, context, given.batch)] = given, given.ended(), process
+                        waiting.popleft()
+                    except BrokenProcessPool:  # it was killed before it had anything to do
+                        processes.add()
+                if not waiting:
+                    processes.release()
+                # A wait without end would not hear Ctrl-C.
+                for future in wait(busy, LISTEN_S, FIRST_COMPLETED).done:
+                    given, ended, process = busy.pop(future)
+                    answer = answer_of(future)
+                    if not isinstance(answer, BrokenProcessPool):
+                        processes.free.append(process)
+                        yield given.batch, answer
+                        continue
+                    killed = given.killed + (given.ended() == ended)
+                    if killed < TRIES:
+                        waiting.append(replace(given, killed=killed))
+                    else:
+                        yield given.batch, answer
+                    processes.add()
+        finally:
+            processes.free += [process for _, _, process in busy.values()]
 
 
 def _context() -> Context:
@@ -100,4 +135,4 @@ def _batch(context: Context, given: Batch) -> Answer:
             tell_while_heard()
             return run_batch(**given)
     except Exception:
-        return flights(given["root"], given["source"], given["jobs"], given["code"])
+        return flights(given["root"], given["source"], given["jobs"], given["code"], watched=True)

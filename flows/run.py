@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -42,14 +41,13 @@ def run_night(
         from fieldcal.batch.night import plan_night
         from fieldcal.flows.housekeeping import tidy_prefect
         from fieldcal.flows.nightly import flow_of
-        from fieldcal.flows.processes import spawned_ahead
+        from fieldcal.flows.processes import Processes
         from fieldcal.flows.runners import Parallel, batches
 
         imported = time.monotonic()
         night = plan_night(archive, root, config, session)
         parallel = Parallel(workers, runner, scheduler)
-        elsewhere = runner == "process" and not parallel.in_this_process(len(batches(night.missing(), workers)))
-        with spawned_ahead(workers) if elsewhere else nullcontext() as processes:
+        with Processes(parallel.spawned(len(batches(night.missing(), workers)))) as processes:
             waiting = time.monotonic()
             url = server.wait()
             start_s = imported - starting + time.monotonic() - waiting

@@ -1,4 +1,4 @@
-"""Where batches of flights run: in this process, in spawned processes of this machine, on Dask, or in a work pool."""
+"""Where batches of flights run: in spawned processes of this machine, on Dask, or in a work pool; never in this one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from prefect_dask.task_runners import DaskTaskRunner
 
 RUNNERS = ("process", "dask", "pool")
-LARGEST_BATCH = 40
+LARGEST_BATCH = 10
 SMALLEST_BATCH = 2
 SHARE_OF_A_WORKER = 4
 
@@ -44,9 +44,9 @@ class Parallel:
                 ReasonCode.WRONG_OPTION, f"runner must be one of {', '.join(RUNNERS)}, not {self.runner!r}."
             )
 
-    def in_this_process(self, n_batches: int) -> bool:
-        """Whether other processes would only cost."""
-        return self.runner == "process" and (self.workers == 1 or n_batches <= 1)
+    def spawned(self, n_batches: int) -> int:
+        """How many processes of this machine so many batches keep busy; one too, for a log may have its own ended."""
+        return min(self.workers, n_batches) if self.runner == "process" else 0
 
 
 def batches(jobs: Sequence[Job], workers: int) -> list[list[Job]]:

@@ -17,7 +17,7 @@ from prefect.utilities.annotations import quote
 
 from fieldcal.batch.documents import Answer
 from fieldcal.batch.flights import flights
-from fieldcal.batch.night import Publishing, Watcher
+from fieldcal.batch.night import Publishing
 from fieldcal.batch.steps import FlightWork
 from fieldcal.config.find import Source
 from fieldcal.flight.job import PlainJob
@@ -44,11 +44,9 @@ def run_step(work: FlightWork, step: str, log_uri: str) -> State[dict[str, str |
 
 
 @task(name="batch", task_run_name="batch {number}", cache_policy=NO_CACHE, persist_result=False)
-def run_batch(
-    number: int, root: str, source: Source, jobs: list[PlainJob], code: str, watcher: Watcher | None = None
-) -> Answer:
-    """A batch of flights, every step a task (`fieldcal.batch.flights.flights`)."""
-    return flights(root, source, jobs, code, do=step_as_task, tell=None if watcher is None else watcher.done)
+def run_batch(number: int, root: str, source: Source, jobs: list[PlainJob], code: str) -> Answer:
+    """A batch of flights, every step a task (`fieldcal.batch.flights.flights`), in a process that can be spared."""
+    return flights(root, source, jobs, code, do=step_as_task, watched=True)
 
 
 @task(name="publish", task_run_name="publish {vehicle_id}", cache_policy=NO_CACHE, persist_result=False)

@@ -11,19 +11,23 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from fieldcal.warehouse.errors import disk
+from fieldcal.reason_codes import ReasonCode
+from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import file_sha256, write_bytes
 from fieldcal.warehouse.layout import checksum_path, history_files
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 
+_TRIES = 3
+"""A file may be replaced between the look at its record and at itself."""
+
 
 @contextmanager
-def recording(root: Path, path: Path, sha256: str) -> Iterator[None]:
-    """Record the sha256 that `path` gets within the block."""
+def recording(root: Path, path: Path, sha256: str, *, dispensable: bool = False) -> Iterator[None]:
+    """Record the sha256 that `path` gets within the block; one that is `dispensable` may be deleted later."""
     before = file_sha256(path) if path.exists() else None
     record(root, path, [sha256, before])
     yield
-    record(root, path, [sha256])
+    record(root, path, [sha256, None] if dispensable else [sha256])
 
 
 def record(root: Path, path: Path, allowed: list[str | None]) -> None:
@@ -61,6 +65,37 @@ def problem(root: Path, path: Path, sha256: str | None) -> str | None:
     if sha256 in allowed:
         return None
     return "it is missing" if sha256 is None else "its content is not what was written: the sha256 differs"
+
+
+def assure(root: Path, paths: Iterable[Path]) -> None:
+    """Make sure, before files are read, that each holds what was written: every byte, by its recorded sha256.
+
+    Where none is recorded, or the record itself is damaged, the file has only the checksums of its pages. One that is
+    absent holds nothing wrong: `verify` tells that it is missing.
+
+    Raises
+    ------
+    WarehouseError
+        `damaged_file`, or the disk's refusal.
+    """
+    for path in paths:
+        if not any(_as_recorded(root, path) for _ in range(_TRIES)):
+            raise WarehouseError(
+                ReasonCode.DAMAGED_FILE,
+                f"{path} is damaged (its content is not what was written: the sha256 differs); `fieldcal verify` lists "
+                f"what else is. Restore it, or remove it and {checksum_path(root, path)} and run the night again: the "
+                "flights are calibrated anew.",
+            )
+
+
+def _as_recorded(root: Path, path: Path) -> bool:
+    if not path.exists():
+        return True
+    try:
+        allowed = recorded(root, path)
+    except BrokenSeal:
+        return True
+    return allowed is None or file_sha256(path) in allowed
 
 
 def history_digest(root: Path, tables: Iterable[str]) -> str:

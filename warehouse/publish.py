@@ -72,6 +72,7 @@ def publish(
 def read_history(root: Path, table: str, vehicle_id: str) -> pl.DataFrame:
     """A vehicle's history as it is; no rows when there is none."""
     path = history_path(root, table, vehicle_id)
+    checksums.assure(root, [path])
     return read_table(path, table) if path.exists() else empty_frame(table)
 
 

@@ -12,6 +12,7 @@ import polars as pl
 from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES, signal_kind
 from fieldcal.schemas.columns import IS_PRIMARY, UNIT_ID
 from fieldcal.schemas.rows import UNIT_OF_OLDER_ROWS
+from fieldcal.warehouse.checksums import assure
 from fieldcal.warehouse.layout import encode_id, history_files, history_path, signal_files, signal_path
 from fieldcal.warehouse.signals import signal_ids
 from fieldcal.warehouse.store import by_absent_columns, empty_frame
@@ -39,9 +40,12 @@ class Warehouse:
 
         Signals come with `vehicle_id` and `flight_id` in front; name a flight unless all of them are meant.
         `vehicle_id` and `flight_id` narrow what is read. Of further units on board: "imu.1", "magnetometer.1", ….
+        Every byte of the files is held against its recorded sha256 before the frame is returned.
 
         Raises
         ------
+        WarehouseError
+            `damaged_file`, `schema_mismatch`.
         ValueError
             There is no such table.
         """
@@ -55,6 +59,7 @@ class Warehouse:
             files = history_files(self.root, table)
         else:
             files = [path for path in [history_path(self.root, table, vehicle_id)] if path.exists()]
+        assure(self.root, files)
         frame = _scan(files, table)
         return frame if flight_id is None else frame.filter(pl.col("flight_id") == flight_id)
 
@@ -79,6 +84,7 @@ class Warehouse:
             files = [path for path in files if path.parent.name == f"vehicle_id={encode_id(vehicle_id)}"]
         if flight_id is not None:
             files = [path for path in files if path.stem == encode_id(flight_id)]
+        assure(self.root, files)
         kind = signal_kind(table)
         return pl.concat([_with_ids(path, kind) for path in files] or [_ids(empty_frame(kind).lazy(), "", "")])
 

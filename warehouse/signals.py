@@ -33,8 +33,10 @@ def signal_writer(
 
 
 def read_signal(root: Path, table: str, vehicle_id: str, flight_id: str) -> pl.DataFrame:
-    """Readings of one flight."""
-    return read_table(signal_path(root, table, vehicle_id, flight_id), signal_kind(table))
+    """Readings of one flight, held against their recorded sha256."""
+    path = signal_path(root, table, vehicle_id, flight_id)
+    checksums.assure(root, [path])
+    return read_table(path, signal_kind(table))
 
 
 def signal_ids(path: Path) -> tuple[str, str]:

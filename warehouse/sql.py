@@ -1,19 +1,24 @@
 """One SELECT over the history in DuckDB, locked down: no files, no network, no settings, bounded in memory and time.
 
-The engine may open the history's own files, named one by one, for reading; everything else external is switched off and
-the configuration locked before the query is looked at.
+The engine works in a process of its own (`sql_engine`), which waits for further questions of this one. It keeps the
+limits as far as it counts; what it does not (plans of many thousand parts, single huge values) meets the end of its
+address space or, by the clock, of the process.
 """
 
 from __future__ import annotations
 
+import atexit
+import json
+import os
+import subprocess
+import sys
 import threading
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
-from typing import TypeAlias, TypedDict
+from typing import NoReturn, TypeAlias, TypedDict
 
-import duckdb
 import polars as pl
 import pyarrow as pa
 
@@ -22,24 +27,20 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import HISTORY_TABLES
 from fieldcal.schemas.columns import IS_PRIMARY, UNIT_ID
 from fieldcal.schemas.rows import UNIT_OF_OLDER_ROWS
+from fieldcal.warehouse.checksums import assure
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.layout import history_files, vehicle_of
 from fieldcal.warehouse.store import by_absent_columns, frame
-from fieldcal.warehouse.view_text import view_text
+from fieldcal.warehouse.views import view_text
 
 # In the order in which they are made: later ones may need earlier ones.
 VIEWS = ("latest_calibration", "history", "drift_by_temperature", "worst_tic", "refusals", "calibration_at")
 
-_READING = frozenset({"SELECT", "EXPLAIN"})
 _ABOUT_ALL = ("show", "describe", "summarize", "information_schema", "duckdb_", "pg_", "pragma_")
-_ROWS_PER_BATCH = 65_536
-_CONFIG: dict[str, str | bool | int | float | list[str]] = {
-    "autoinstall_known_extensions": False,
-    "autoload_known_extensions": False,
-    "allow_community_extensions": False,
-    "python_enable_replacements": False,
-    "temp_directory": "",
-}
+_ENGINE = Path(__file__).with_name("sql_engine.py")
+_EPOCH_DAY = date(1970, 1, 1).toordinal()
+_GRACE_S = 1.0
+"""Time for the engine to stop by itself."""
 
 
 SqlValue: TypeAlias = str | bool | int | float | date | datetime | None
@@ -79,13 +80,22 @@ def run_sql(
         `sql_timeout`, `sql_too_large`.
     """
     texts = {view: view_text(view) for view in VIEWS}
-    with _sentences(timeout_s, memory_mb):
-        try:
-            return _answer(root, query, parameters, _named(query, texts), timeout_s, memory_mb, max_result_mb)
-        except (
-            duckdb.CatalogException
-        ):  # a name that was not recognised in the text, or a mistake, best explained by all
-            return _answer(root, query, parameters, texts, timeout_s, memory_mb, max_result_mb)
+    limits: dict[str, float] = {"timeout_s": timeout_s, "memory_mb": memory_mb, "max_result_mb": max_result_mb}
+    asked = {"query": query, "parameters": _plain(parameters), **limits}
+    engine = _engine()
+    try:
+        answer = engine.asked({**asked, **_made(root, query, _named(query, texts))}, timeout_s)
+        if isinstance(answer, _Failed) and answer.kind == "catalog":
+            # A name that was not recognised in the text, or a mistake, best explained by all.
+            answer = engine.asked({**asked, **_made(root, query, texts)}, timeout_s)
+    except BaseException:
+        engine.end()
+        raise
+    if engine.lives():
+        _idle.append(engine)
+    if isinstance(answer, _Failed):
+        _refuse(answer, limits)
+    return _shown(answer)
 
 
 def _named(query: str, texts: Mapping[str, str]) -> dict[str, str]:
@@ -99,38 +109,32 @@ def _named(query: str, texts: Mapping[str, str]) -> dict[str, str]:
     return dict(reversed(named.items()))
 
 
-def _answer(
-    root: Path,
-    query: str,
-    parameters: Sequence[SqlValue] | None,
-    views: Mapping[str, str],
-    timeout_s: float,
-    memory_mb: int,
-    max_result_mb: int,
-) -> pl.DataFrame:
+def _made(root: Path, query: str, views: Mapping[str, str]) -> dict[str, object]:
+    """Statements that make the tables and views that a query may name, and the files that it may open."""
     needed = "".join([query.lower(), *views.values()]) if len(views) < len(VIEWS) else "".join(HISTORY_TABLES)
-    with duckdb.connect(":memory:", config={**_CONFIG, "memory_limit": f"{memory_mb}MB"}) as connection:
-        paths = {table: history_files(root, table) for table in HISTORY_TABLES if table in needed}
-        for table, own in paths.items():
-            if own:
-                connection.execute(_table_view(table, own))
-            else:
-                connection.register(table, schemas.arrow_schema(table).empty_table())
-        for text in views.values():
-            connection.execute(text)
-        connection.execute("SET TimeZone = 'UTC'")
-        connection.execute(f"SET allowed_paths = {_listed([path for own in paths.values() for path in own])}")
-        connection.execute("SET enable_external_access = false")
-        connection.execute("SET lock_configuration = true")
-        with _time_limit(connection, timeout_s):
-            statement = _one_reading_statement(connection, query)
-            return _result(connection.sql(statement, params=parameters), max_result_mb)
+    paths = {table: history_files(root, table) for table in HISTORY_TABLES if table in needed}
+    assure(root, [path for own in paths.values() for path in own])
+    tables = [_table_view(table, own) if own else _empty_table(table) for table, own in paths.items()]
+    return {"made": [*tables, *views.values()], "paths": _listed([path for own in paths.values() for path in own])}
 
 
 def _table_view(table: str, paths: Sequence[Path]) -> str:
     """A view over a table's files; also where columns are younger than a file."""
     forms = by_absent_columns(paths, table)
     return f"CREATE VIEW {table} AS {' UNION ALL '.join(_select(table, own, absent) for absent, own in forms.items())}"
+
+
+def _empty_table(table: str) -> str:
+    columns = ", ".join(f'"{field.name}" {_sql_type(field)}' for field in schemas.arrow_schema(table))
+    return f"CREATE TABLE {table} ({columns})"
+
+
+def _sql_type(field: pa.Field) -> str:
+    """DuckDB's type of a column of a table."""
+    import duckdb
+
+    (kind,) = duckdb.from_arrow(pa.schema([field]).empty_table()).types
+    return str(kind)
 
 
 def _select(table: str, paths: Sequence[Path], absent: Collection[str]) -> str:
@@ -153,9 +157,7 @@ def _younger(table: str, name: str) -> str:
         return f'f."{UNIT_OF_OLDER_ROWS}" AS "{name}"'
     if name == IS_PRIMARY.name:
         return f'TRUE AS "{name}"'
-    column = schemas.arrow_schema(table).field(name)
-    (kind,) = duckdb.from_arrow(pa.schema([column]).empty_table()).types
-    return f'CAST(NULL AS {kind}) AS "{name}"'
+    return f'CAST(NULL AS {_sql_type(schemas.arrow_schema(table).field(name))}) AS "{name}"'
 
 
 def _listed(paths: Sequence[Path]) -> str:
@@ -164,60 +166,136 @@ def _listed(paths: Sequence[Path]) -> str:
     return f"[{', '.join(quoted)}]"
 
 
-def _one_reading_statement(connection: duckdb.DuckDBPyConnection, query: str) -> duckdb.Statement:
-    statements = connection.extract_statements(query)
-    kinds = [statement.type.name for statement in statements]
-    if len(kinds) == 1 and kinds[0] in _READING:
-        return statements[0]
-    what = "nothing" if not kinds else ", ".join(kinds)
-    raise WarehouseError(
-        ReasonCode.SQL_REFUSED, f"Only a single SELECT is answered here; this is {what}. The tables are read-only."
-    )
+def _plain(parameters: Sequence[SqlValue] | None) -> list[list[object]] | None:
+    """Parameters as JSON, each with its kind."""
+    if parameters is None:
+        return None
+    return [
+        [type(value).__name__, value.isoformat() if isinstance(value, date) else value]  # a datetime is a date too
+        for value in parameters
+    ]
 
 
-def _result(answer: duckdb.DuckDBPyRelation, max_result_mb: int) -> pl.DataFrame:
-    reader: pa.RecordBatchReader = answer.to_arrow_reader(_ROWS_PER_BATCH)
-    batches: list[pa.RecordBatch] = []
-    size = 0
-    for batch in reader:
-        size += batch.nbytes
-        if size > max_result_mb << 20:
-            raise WarehouseError(
-                ReasonCode.SQL_TOO_LARGE, f"The result is larger than {max_result_mb} MB; aggregate it or add a LIMIT."
-            )
-        batches.append(batch)
-    return frame(pa.Table.from_batches(batches, schema=reader.schema))
+@dataclass(frozen=True)
+class _Failed:
+    """What kind of failure, and DuckDB's own words."""
+
+    kind: str
+    words: str
 
 
-@contextmanager
-def _time_limit(connection: duckdb.DuckDBPyConnection, timeout_s: float) -> Iterator[None]:
-    timer = threading.Timer(timeout_s, connection.interrupt)
-    timer.daemon = True
-    timer.start()
+class _Engine:
+    """A process of `sql_engine`."""
+
+    def __init__(self) -> None:
+        self.owner = os.getpid()
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", str(_ENGINE)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,  # where it dies it says so to nobody
+        )
+
+    def lives(self) -> bool:
+        return self._process.poll() is None
+
+    def end(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def asked(self, question: Mapping[str, object], timeout_s: float) -> pa.Table | _Failed:
+        """The answer, within the time and a little more."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        late = threading.Event()
+
+        def stop() -> None:
+            late.set()
+            self._process.kill()
+
+        timer = threading.Timer(timeout_s + _GRACE_S, stop)
+        timer.daemon = True
+        timer.start()
+        try:
+            self._process.stdin.write(json.dumps(question).encode() + b"\n")
+            self._process.stdin.flush()
+            error = json.loads(self._process.stdout.readline())["error"]
+            if error is not None:
+                return _Failed(*error)
+            with pa.ipc.open_stream(self._process.stdout) as stream:
+                return stream.read_all()
+        except (OSError, ValueError):  # it ended in the middle, ArrowInvalid among them
+            self.end()
+            return _Failed("timeout" if late.is_set() else "memory", "")
+        finally:
+            timer.cancel()
+
+
+_idle: list[_Engine] = []
+"""Engines that wait: starting one takes a fifth of a second."""
+
+
+def _engine() -> _Engine:
+    """One that waits, else a new one. Those that died meanwhile, or are another process's, are passed over."""
+    while _idle:
+        engine = _idle.pop()
+        if engine.owner == os.getpid() and engine.lives():
+            return engine
+    return _Engine()
+
+
+@atexit.register
+def _end_engines() -> None:
+    while _idle:
+        engine = _idle.pop()
+        if engine.owner == os.getpid():
+            engine.end()
+
+
+def _shown(answer: pa.Table) -> pl.DataFrame:
+    listed = ", ".join(f"{field.name[:40]} ({field.type})" for field in answer.schema)
     try:
-        yield
-    finally:
-        timer.cancel()
+        shown = frame(answer)
+    except pl.exceptions.DuplicateError as error:
+        what = f"Two columns of the answer have one name, among {listed}: name them with AS."
+        raise WarehouseError(ReasonCode.SQL_WRONG, what) from error
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, pa.ArrowException, TypeError, ValueError) as error:
+        what = f"The answer has a column of a type that cannot be shown, among {listed}: CAST it to VARCHAR."
+        raise WarehouseError(ReasonCode.SQL_WRONG, what) from error
+    for column in shown:
+        if isinstance(column.dtype, pl.Date | pl.Datetime) and not _in_calendar(column):
+            what = f"{column.name} holds times beyond the years 1 to 9999, which cannot be shown: CAST it to VARCHAR."
+            raise WarehouseError(ReasonCode.SQL_WRONG, what)
+    return shown
 
 
-@contextmanager
-def _sentences(timeout_s: float, memory_mb: int) -> Iterator[None]:
+def _in_calendar(column: pl.Series) -> bool:
+    """Whether all times of a column are such as Python knows."""
+    days = column.cast(pl.Datetime("ms")).to_physical() if isinstance(column.dtype, pl.Datetime) else None
+    whole = column.to_physical() if days is None else days // 86_400_000
+    return bool(whole.is_between(date.min.toordinal() - _EPOCH_DAY, date.max.toordinal() - _EPOCH_DAY).all())
+
+
+def _refuse(failed: _Failed, limits: Mapping[str, float]) -> NoReturn:
     """DuckDB's errors as ours."""
-    try:
-        yield
-    except duckdb.InterruptException as error:
-        raise WarehouseError(
-            ReasonCode.SQL_TIMEOUT, f"The query took longer than {timeout_s:g} s and was stopped."
-        ) from error
-    except duckdb.OutOfMemoryException as error:
-        raise WarehouseError(
-            ReasonCode.SQL_TOO_LARGE,
-            f"The query needs more than {memory_mb} MB; narrow it, for instance by vehicle_id.",
-        ) from error
-    except duckdb.PermissionException as error:
-        raise WarehouseError(
+    sentences = {
+        "not one": (
+            ReasonCode.SQL_REFUSED,
+            f"Only a single SELECT is answered here; this is {failed.words}. The tables are read-only.",
+        ),
+        "reach": (
             ReasonCode.SQL_REFUSED,
             "Files and extensions are out of reach of SQL here: it reads the warehouse's tables only.",
-        ) from error
-    except duckdb.Error as error:
-        raise WarehouseError(ReasonCode.SQL_WRONG, f"The query cannot be answered: {str(error).strip()}") from error
+        ),
+        "timeout": (ReasonCode.SQL_TIMEOUT, f"The query took longer than {limits['timeout_s']:g} s and was stopped."),
+        "memory": (
+            ReasonCode.SQL_TOO_LARGE,
+            f"The query needs more than {limits['memory_mb']:g} MB; narrow it, for instance by vehicle_id.",
+        ),
+        "too large": (
+            ReasonCode.SQL_TOO_LARGE,
+            f"The result is larger than {limits['max_result_mb']:g} MB; aggregate it or add a LIMIT.",
+        ),
+    }
+    wrong = (ReasonCode.SQL_WRONG, f"The query cannot be answered: {failed.words}")
+    raise WarehouseError(*sentences.get(failed.kind, wrong))

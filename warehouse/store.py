@@ -188,7 +188,7 @@ def read_arrow(source: Path | bytes, table: str, *, stage: bool = False, name: s
             return _with_nulls(rows, absent, table, stage)
     except SchemaMismatch as error:
         raise WarehouseError(ReasonCode.SCHEMA_MISMATCH, f"{shown}: {error}.") from error
-    except (pa.ArrowException, OSError, ValueError) as error:
+    except (pa.ArrowException, pl.exceptions.PanicException, OSError, ValueError) as error:
         first_line = (str(error).splitlines() or [type(error).__name__])[0]
         raise WarehouseError(
             ReasonCode.DAMAGED_FILE, f"{shown} is damaged ({first_line}); `fieldcal verify` lists what else is."
@@ -212,7 +212,7 @@ def by_absent_columns(paths: Iterable[Path], table: str) -> dict[tuple[str, ...]
                 absent = schemas.check(pq.read_schema(path), table)
         except SchemaMismatch as error:
             raise WarehouseError(ReasonCode.SCHEMA_MISMATCH, f"{path}: {error}.") from error
-        except (pl.exceptions.PolarsError, pa.ArrowException, OSError, ValueError):
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, pa.ArrowException, OSError, ValueError):
             pass  # damaged: whoever reads its rows says so
         found.setdefault(absent, []).append(path)
     return found

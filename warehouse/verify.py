@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypedDict
@@ -17,6 +18,8 @@ from fieldcal.warehouse.sealed import BrokenSeal, unseal
 from fieldcal.warehouse.stage_store import RECORD, broken_outputs, outputs_of
 from fieldcal.warehouse.store import read_table
 
+SHA256_BYTES = hashlib.sha256().digest_size
+"""Arrays that a night remembers begin with the digest of what follows."""
 Problem = tuple[str, str | None]
 """A path as shown, and what is wrong with it (None: nothing)."""
 
@@ -38,7 +41,8 @@ class Verification(TypedDict):
 
 
 def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path], str] | None = None) -> Verification:
-    """Check `tables/`, `signals/`, complete stage outputs, what nights remember and, with `archive`, the logs.
+    """Check `tables/`, `signals/`, `reports/`, complete stage outputs, what nights remember and, with `archive`, the
+    logs. Reports that an older release wrote have no recorded sha256 and are passed over.
 
     Nothing is changed.
 
@@ -76,7 +80,7 @@ def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path],
 
 
 def _recorded_files(root: Path) -> Iterator[Problem]:
-    """Files of the history and the signals: those there, and those that should be."""
+    """Files of the history and the signals: those there, and all that should be."""
     paths = {path for part in ("tables", "signals") for path in (root / part).rglob("*") if _kept(path)}
     records = root / "checksums"
     paths |= {
@@ -120,6 +124,11 @@ def _night_files(root: Path) -> Iterator[Problem]:
             yield str(path.relative_to(root)), None
         except (BrokenSeal, WarehouseError) as error:
             yield str(path.relative_to(root)), f"what the night remembers is damaged: {error}; it may be deleted"
+    for path in sorted((root / "night").rglob("*.npz")):
+        with disk(path, "read"):
+            data = path.read_bytes()
+        whole = hashlib.sha256(data[SHA256_BYTES:]).digest() == data[:SHA256_BYTES]
+        yield str(path.relative_to(root)), None if whole else "what the night remembers is damaged; it may be deleted"
 
 
 def _logs(root: Path, archive: Path, log_sha256: Callable[[Path], str]) -> Iterator[Problem]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 from fieldcal.batch.documents import Answer, PlainOutcome
+from fieldcal.batch.limits import WATCH
 from fieldcal.batch.outcome import Outcome, failed_outcome
 from fieldcal.batch.sources import know_sources
 from fieldcal.batch.steps import FlightWork
@@ -30,8 +32,12 @@ Step = Callable[[FlightWork, str], object]
 """Make sure that a step's result is there."""
 
 
-def one_flight(root: Path, job: Job, settings: Configuration, do: Step = FlightWork.do) -> Outcome:
+def one_flight(
+    root: Path, job: Job, settings: Configuration, do: Step = FlightWork.do, *, watched: bool = False
+) -> Outcome:
     """All steps of one flight. Whatever goes wrong costs this flight alone.
+
+    `watched`: if it takes more than the limits, this process is ended, and whoever started it goes on from there.
 
     Raises
     ------
@@ -41,17 +47,24 @@ def one_flight(root: Path, job: Job, settings: Configuration, do: Step = FlightW
     records: dict[str, Record] = {}
     why: dict[str, str] = {}
     work_s = 0.0
-    for work, step in _steps(FlightWork(root, job, settings.vehicle(job.vehicle_id))):
-        before_s = work.work_s
-        try:
-            do(work, step)
-        except WarehouseError:
-            raise
-        except Exception as error:
-            return failed_outcome(job, records | work.records, step, unforeseen(job.log_uri, error))
-        records, why, work_s = records | work.records, why | work.why, work_s + work.work_s - before_s
+    vehicle, limits = settings.vehicle(job.vehicle_id), settings.limits
+    with WATCH.over(root, job, vehicle, limits) if watched else nullcontext(_unwatched) as begins:
+        for work, step in _steps(FlightWork(root, job, vehicle, limits)):
+            before_s = work.work_s
+            begins(step)
+            try:
+                do(work, step)
+            except WarehouseError:
+                raise
+            except Exception as error:
+                return failed_outcome(job, records | work.records, step, unforeseen(job.log_uri, error))
+            records, why, work_s = records | work.records, why | work.why, work_s + work.work_s - before_s
     ran, cached = (tuple(step for step in records if (step in why) == new) for new in (True, False))
     return Outcome(job, records, ran, cached, why, work_s)
+
+
+def _unwatched(step: str) -> None:
+    pass
 
 
 def _steps(work: FlightWork) -> Iterator[tuple[FlightWork, str]]:
@@ -68,11 +81,13 @@ def flights(
     jobs: Sequence[PlainJob],
     code: str,
     do: Step = FlightWork.do,
-    tell: Callable[[Outcome], None] | None = None,
+    *,
+    watched: bool = False,
 ) -> Answer:
     """A batch of flights in this process: `outcomes`, plain JSON, and `error`: what concerns every log of the night.
 
     `code` is the `code_digest` of the process that planned the night; a process with other code does nothing.
+    `watched`: a log that takes more than its limits ends this process.
     """
     outcomes: list[PlainOutcome] = []
     if code_digest() != code:
@@ -82,10 +97,8 @@ def flights(
     try:
         with one_thread():
             for job in jobs:
-                outcome = one_flight(Path(root), Job(**job), settings, do)
+                outcome = one_flight(Path(root), Job(**job), settings, do, watched=watched)
                 outcomes.append(outcome.plain())
-                if tell is not None:
-                    tell(outcome)
     except WarehouseError as error:
         return {"outcomes": outcomes, "error": [error.reason_code, error.sentence]}
     return {"outcomes": outcomes, "error": None}

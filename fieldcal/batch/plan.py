@@ -38,7 +38,7 @@ def make_plan(root: Path, archive: Path, configuration: Configuration, session: 
     unread = find_unread(archive, {job.log_uri for job in found}, session)
     plan = Plan(copies=copies, copied=[job for job in found if job.log_uri in copies], unread=unread)
     for job in kept:
-        work = FlightWork(root, job, configuration.vehicle(job.vehicle_id))
+        work = FlightWork(root, job, configuration.vehicle(job.vehicle_id), configuration.limits)
         pending = work.pending()
         plan.jobs.append(job)
         if pending:

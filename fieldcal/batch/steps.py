@@ -14,9 +14,10 @@ from typing import cast
 
 import polars as pl
 
+from fieldcal.batch.limits import why_ended
 from fieldcal.batch.reasons import NO_RESULT, why_it_runs
 from fieldcal.batch.sources import sources
-from fieldcal.config.configuration import Vehicle
+from fieldcal.config.configuration import Limits, Vehicle
 from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.config.reader_settings import reader_settings
 from fieldcal.config.stage_settings import as_json, taken_from
@@ -60,12 +61,17 @@ class FlightWork:
         The log.
     vehicle : Vehicle
         Its vehicle's configuration.
+    limits : Limits
+        What the log may take: one that was ended for taking more is rejected without another try.
     table : str
         The unit, by the table of its readings.
     """
 
-    def __init__(self, root: Path, job: Job, vehicle: Vehicle, table: str = PRIMARY) -> None:
+    def __init__(
+        self, root: Path, job: Job, vehicle: Vehicle, limits: Limits | None = None, table: str = PRIMARY
+    ) -> None:
         self.job = job
+        self.limits = limits or Limits()
         self.table = table
         self.records: dict[str, Record] = {}
         self.why: dict[str, str] = {}
@@ -92,7 +98,7 @@ class FlightWork:
         """The work on each further unit on board that is to be calibrated."""
         facts = self.records[INGEST]["facts"]
         for unit in units_of(facts, self._vehicle, self.job.vehicle_id)[1:] if self.usable() else ():
-            other = FlightWork(self._root, self.job, self._vehicle, unit.table)
+            other = FlightWork(self._root, self.job, self._vehicle, self.limits, unit.table)
             other._take(INGEST, self.records[INGEST])
             yield other
 
@@ -108,6 +114,12 @@ class FlightWork:
 
     def find(self, step: str) -> Record | None:
         """The record of a step whose result is there and whole, taken as the step's; else None, and `why` says why."""
+        if step == INGEST and (ended := why_ended(self._root, self.job, self._vehicle, self.limits)):
+            refused = self._ingest_record(
+                ingest.rejected(ReasonCode.OVER_LIMITS, ended), {}, self.key(INGEST), keep=False
+            )
+            self._take(INGEST, refused)
+            return refused
         stored = self._store.complete(step, self.job.flight_id, self.key(step))
         record = None if stored is None else _of_store(stored)
         if record is None or (step == INGEST and not self._signals_whole(record)):

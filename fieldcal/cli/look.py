@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fieldcal.cli.options import AsJson, Config, UnusedConfig, UnusedRoot
+from fieldcal.words.printable import printable
 
 if TYPE_CHECKING:
     from fieldcal.flight.inspection import Inspection
@@ -35,7 +36,7 @@ def inspect(log: Path, /, *, as_json: AsJson = False, config: Config = None, war
     if as_json:
         print_json(asdict(found))
     else:
-        print("\n".join(screen(found)))
+        print("\n".join(map(printable, screen(found))))
     return OK if found.verdict == Verdict.OK else LOSSES
 
 

@@ -22,6 +22,7 @@ from fieldcal.cli.serve import serve, trigger
 from fieldcal.cli.simulate import simulate
 from fieldcal.names import Verdict
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.words.printable import printable
 
 OK, FAILED, USAGE, LOSSES, BUSY, INTERRUPTED = 0, 1, 2, 3, 75, 130
 USAGE_CODES = (
@@ -238,7 +239,7 @@ def verify(
         print_json(result)
     else:
         for damage in result["damaged"]:
-            print(f"{damage['path']}: {damage['reason']}")
+            print(printable(f"{damage['path']}: {damage['reason']}"))
         say(f"{result['files']} files checked, {len(result['damaged'])} damaged")
         print(f"content_sha256 {result['content_sha256'] or 'unknown: tables are damaged'}")
     return OK if result["ok"] else FAILED
@@ -270,7 +271,7 @@ def doctor(
     else:
         for check in result.checks:
             advice = f"\n{'':23}{check.advice}" if check.advice else ""
-            print(f"{check.status:8} {check.check:14}{check.found}{advice}")
+            print(printable(f"{check.status:8} {check.check:14}{check.found}{advice}"))
     return OK if result.ok else FAILED
 
 
@@ -316,7 +317,7 @@ def _explained(error: Exception) -> int:
 
 
 def _told(sentence: str, code: int) -> int:
-    print(f"fieldcal: {' '.join(sentence.split())}", file=sys.stderr)
+    print(f"fieldcal: {printable(' '.join(sentence.split()))}", file=sys.stderr)
     return code
 
 

@@ -6,6 +6,7 @@ import sys
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
+from fieldcal.words.printable import printable
 from fieldcal.words.talk import say
 
 if TYPE_CHECKING:
@@ -30,7 +31,8 @@ class NightProgress:
             from rich.console import Console
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-            columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+            name = TextColumn("{task.description}", markup=False)
+            columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), name)
             self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
             self._bar.add_task("", total=flights)
             self._bar.start()
@@ -39,7 +41,7 @@ class NightProgress:
         """A flight is done."""
         self._done += 1
         if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], advance=1, description=outcome.job.log_uri)
+            self._bar.update(self._bar.task_ids[0], advance=1, description=printable(outcome.job.log_uri))
         elif outcome.ran:
             from fieldcal.batch.outcome import cause
 

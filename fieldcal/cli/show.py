@@ -7,9 +7,10 @@ import json
 import sys
 from collections.abc import Iterable, Sequence
 from datetime import date, time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fieldcal.words.numbers import cell
+from fieldcal.words.printable import csv_cell, json_printable, printable
 from fieldcal.words.rows import rows_of
 from fieldcal.words.talk import say
 
@@ -24,13 +25,14 @@ FRAME_WIDTH = 1000
 
 def print_json(document: object) -> None:
     """One JSON document on stdout."""
-    print(json.dumps(document, ensure_ascii=False, indent=1, allow_nan=False, default=_as_json))
+    text = json.dumps(document, ensure_ascii=False, indent=1, allow_nan=False, default=_as_json)
+    print(json_printable(text))
 
 
 def print_csv(frame: pl.DataFrame) -> None:
-    """A frame as CSV on stdout; lists and structures as JSON."""
+    """A frame as CSV on stdout; lists and structures as JSON, texts so that no spreadsheet takes one for a formula."""
     writer = csv.writer(sys.stdout, lineterminator="\n")
-    writer.writerow(frame.columns)
+    writer.writerow([csv_cell(name) for name in frame.columns])
     writer.writerows([_as_csv(value) for value in row] for row in frame.iter_rows())
 
 
@@ -47,10 +49,14 @@ def print_frame(frame: pl.DataFrame, *, as_json: bool, as_csv: bool) -> None:
 
 
 def console(*, plain_width: int = PLAIN_WIDTH) -> Console:
-    """The console of stdout; `plain_width` wide when it is no terminal."""
+    """The console of stdout; `plain_width` wide when it is no terminal. Lines of text are shown `printable`."""
     from rich.console import Console
 
-    return Console(file=sys.stdout, width=None if sys.stdout.isatty() else plain_width, highlight=False)
+    class PrintableConsole(Console):
+        def print(self, *objects: object, **how: Any) -> None:
+            super().print(*(printable(shown) if isinstance(shown, str) else shown for shown in objects), **how)
+
+    return PrintableConsole(file=sys.stdout, width=None if sys.stdout.isatty() else plain_width, highlight=False)
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None) -> Table:
@@ -63,9 +69,9 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]], title: str | No
     result = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", title_style="bold", pad_edge=False)
     for i, name in enumerate(columns):
         numeric = bool(listed) and all(_numeric(row[i]) for row in listed)
-        result.add_column(name, justify="right" if numeric else "left", overflow="fold")
+        result.add_column(Text(printable(name)), justify="right" if numeric else "left", overflow="fold")
     for row in listed:
-        result.add_row(*(Text(text) for text in row))
+        result.add_row(*(Text(printable(text)) for text in row))
     return result
 
 
@@ -79,5 +85,7 @@ def _as_json(value: object) -> str:
 
 def _as_csv(value: object) -> object:
     if isinstance(value, list | dict):
-        return json.dumps(value, ensure_ascii=False, default=_as_json)
+        return csv_cell(json.dumps(value, ensure_ascii=False, default=_as_json))
+    if isinstance(value, str):
+        return csv_cell(value)
     return value.isoformat() if isinstance(value, date | time) else value

@@ -251,6 +251,14 @@ class Alerts(Table):
     idle_days: Annotated[Positive, _meaning("time without a usable flight after which a vehicle is idle", "d")] = 30.0
 
 
+class Limits(Table):
+    """What one log may take of the machine in a night, reading and all stages together. Results do not depend on it."""
+
+    seconds: Annotated[Positive, _meaning("time after which the work on a log is ended", "s")] = 7200.0
+    cpu_seconds: Annotated[Positive, _meaning("time of the processor after which it is ended", "s")] = 3600.0
+    memory_mb: Annotated[Positive, _meaning("memory of its process beyond which it is ended", "MB")] = 8192.0
+
+
 class Document(Table):
     """The whole of `fieldcal.toml`."""
 
@@ -260,6 +268,7 @@ class Document(Table):
     vehicles: Annotated[dict[str, VehicleTable], _meaning("by the vehicle's folder")] = {}
     archive: Archive = Archive()
     alerts: Alerts = Alerts()
+    limits: Limits = Limits()
 
 
 @dataclass(frozen=True)
@@ -283,6 +292,11 @@ class Configuration:
     def alerts(self) -> Alerts:
         """When the report warns."""
         return self.document.alerts
+
+    @property
+    def limits(self) -> Limits:
+        """What one log may take of the machine."""
+        return self.document.limits
 
     def vehicle(self, vehicle_id: str) -> Vehicle:
         """What is configured for `vehicle_id`."""

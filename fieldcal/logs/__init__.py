@@ -16,7 +16,7 @@ from fieldcal.config.configuration import Vehicle
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.csv.reader import CsvLog
 from fieldcal.logs.dataflash.reader import DataflashLog
-from fieldcal.logs.discovery import find_logs, flight_id, log_format, log_sha256
+from fieldcal.logs.discovery import find_logs, flight_id, is_stored, log_format, log_sha256
 from fieldcal.logs.interface import (
     SIGNAL_COLUMNS,
     UNKNOWN_UNIT,
@@ -63,6 +63,10 @@ def open_log(path: Path, vehicle: Vehicle) -> LogReader:
     """
     if not path.exists():
         raise UnreadableLog(ReasonCode.NOT_FOUND, f"{path.name} does not exist. Check the path.")
+    if not is_stored(path):
+        raise UnreadableLog(
+            ReasonCode.NOT_READABLE, f"{path.name} is a pipe, socket or device. Save its content to a file."
+        )
     kind = log_format(path)
     if kind not in READERS:
         what = "a folder that is neither a ROS 2 bag nor has imu.csv" if path.is_dir() else f"a {path.suffix or 'file'}"

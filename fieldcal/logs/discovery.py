@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Protocol
@@ -100,7 +101,8 @@ def find_logs(archive: Path, logs_map: Iterable[LogsEntry] | None = None) -> lis
 
     Notes
     -----
-    A session's folder that is a ROS 2 bag is the one log of its session. Hidden names are skipped.
+    A session's folder that is a ROS 2 bag is the one log of its session. Hidden names are skipped, and so is what is
+    neither file nor folder (a pipe would be read for ever) or lies under a name that is no text.
     Links are followed only while they stay inside the archive, those of a folder's files too.
     """
     root = archive.resolve()
@@ -127,7 +129,7 @@ def find_logs(archive: Path, logs_map: Iterable[LogsEntry] | None = None) -> lis
 
 
 def _add(found: dict[str, LogFile], archive: Path, root: Path, path: Path, vehicle: str, session: str) -> None:
-    if not inside(path, root):
+    if not inside(path, root) or not is_stored(path) or not named_in_text(path.relative_to(archive)):
         return
     try:
         kind = log_format(path)
@@ -157,6 +159,24 @@ def entries(folder: Path) -> list[Path]:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError:
         return []
+
+
+def is_stored(path: Path) -> bool:
+    """Whether a path is a file or folder, or may be one that this user may not look at: no pipe, socket or device."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return True
+    return stat.S_ISREG(mode) or stat.S_ISDIR(mode)
+
+
+def named_in_text(path: Path) -> bool:
+    """Whether a name is UTF-8, as all that are stored are: others could not come back as they are."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def inside(path: Path, root: Path) -> bool:

@@ -32,6 +32,9 @@ from fieldcal.schemas import signal_kind
 
 LEAST_SAMPLES = 10
 SECONDS_ALLOWED = 60.0
+CPU_SECONDS_ALLOWED = 10.0
+CPU_SECONDS_PER_MB = 5.0
+"""Real logs take .1 s for every MB, of JSON in packed chunks 1 s."""
 TOO_SLOW = ReasonCode.TOO_SLOW
 """The one refusal that another try may not meet again."""
 
@@ -49,12 +52,22 @@ class TidyLog:
         What findings call it.
     whole : bool
         Hold every row until the end: for logs that were found `Disordered`.
-    seconds : float
-        How long reading may take.
+    seconds, cpu_seconds : float
+        How long reading may take, and how much of the processor's time.
     """
 
-    def __init__(self, reader: LogReader, name: str, *, whole: bool = False, seconds: float = math.inf) -> None:
+    def __init__(
+        self,
+        reader: LogReader,
+        name: str,
+        *,
+        whole: bool = False,
+        seconds: float = math.inf,
+        cpu_seconds: float = math.inf,
+    ) -> None:
         self._give_up = time.monotonic() + seconds
+        self._give_up_cpu = time.thread_time() + cpu_seconds
+        self._cpu_seconds = cpu_seconds
         self._seconds = seconds
         self._reader = reader
         self._name = name
@@ -70,7 +83,7 @@ class TidyLog:
         Raises
         ------
         UnreadableLog
-            The log cannot be read, nothing in it is usable, or it takes too long (`too_slow`).
+            The log cannot be read, nothing in it is usable, or it takes too long (`too_slow`, `over_limits`).
         Disordered
             See `TidySignal.add`.
         """
@@ -80,6 +93,13 @@ class TidyLog:
                     TOO_SLOW,
                     f"{self._name} was still being read after {self._seconds:.0f} s, {SECONDS_ALLOWED:.0f} s and 1 s "
                     "for every MB are allowed. Check the disk; the next night tries again.",
+                )
+            if time.thread_time() > self._give_up_cpu:
+                raise UnreadableLog(
+                    ReasonCode.OVER_LIMITS,
+                    f"{self._name} took {self._cpu_seconds:.0f} s of the processor and was not read yet; "
+                    f"{CPU_SECONDS_ALLOWED:.0f} s and {CPU_SECONDS_PER_MB:.0f} s for every MB are allowed: it unpacks "
+                    "to far more than a log does. Check what it is.",
                 )
             signal = self._signals.setdefault(table, TidySignal(table, self._held_rows))
             for frame in signal.add(columns):
@@ -186,7 +206,8 @@ def tidy_log(path: Path, vehicle: Vehicle, *, whole: bool = False) -> TidyLog:
     """Open a log for tidying. Raises as `open_log`."""
     reader = open_log(path, vehicle)
     size = sum(part.stat().st_size for part in (folder_parts(path) if path.is_dir() else [path]))
-    return TidyLog(reader, path.name, whole=whole, seconds=SECONDS_ALLOWED + size / 1e6)
+    cpu_seconds = CPU_SECONDS_ALLOWED + CPU_SECONDS_PER_MB * size / 1e6
+    return TidyLog(reader, path.name, whole=whole, seconds=SECONDS_ALLOWED + size / 1e6, cpu_seconds=cpu_seconds)
 
 
 def logged_units(path: Path, vehicle: Vehicle) -> dict[str, str]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 
-from fieldcal.logs.discovery import LOG_FORMATS, entries, inside
+from fieldcal.logs.discovery import LOG_FORMATS, entries, inside, is_stored, named_in_text
 
 BESIDE_LOGS = (
     "readme*",
@@ -27,6 +28,8 @@ BESIDE_LOGS = (
 UNKNOWN = "no known kind of log"
 UNKNOWN_FOLDER = "a folder that is no log"
 OUTSIDE = "a link that leads out of the archive or nowhere"
+NO_TEXT = "its name is not UTF-8: rename it"
+NOT_STORED = "a pipe, socket or device"
 MISPLACED = "in no folder of a session, nor named in archive.logs"
 
 
@@ -52,7 +55,7 @@ def find_unread(archive: Path, log_uris: Collection[str], session: Path | None =
     taken = {uri.rpartition("/")[0] for uri in log_uris}
     found = []
     for path, depth in _walk(archive, root, set(log_uris)):
-        uri = path.relative_to(archive).as_posix()
+        uri = os.fsencode(path.relative_to(archive).as_posix()).decode("utf-8", "backslashreplace")
         if session is not None and not path.parent.resolve().is_relative_to(session.resolve()):
             continue
         if uri in log_uris or any(fnmatch(path.name.lower(), pattern) for pattern in BESIDE_LOGS):
@@ -78,17 +81,28 @@ def _walk(archive: Path, root: Path, log_uris: Collection[str]) -> Iterator[tupl
     level = [archive]
     for depth in range(3):
         content = [path for folder in level for path in entries(folder)]
-        yield from ((path, depth) for path in content if depth == 2 or not path.is_dir())
+        yield from ((path, depth) for path in content if depth == 2 or not path.is_dir() or not _named(path))
         level = [
             path
             for path in content
-            if inside(path, root) and path.is_dir() and path.relative_to(archive).as_posix() not in log_uris
+            if inside(path, root)
+            and path.is_dir()
+            and _named(path)
+            and path.relative_to(archive).as_posix() not in log_uris
         ]
+
+
+def _named(path: Path) -> bool:
+    return named_in_text(Path(path.name))
 
 
 def _reason(path: Path, root: Path, depth: int) -> str | None:
     if not inside(path, root):
         return OUTSIDE
+    if not _named(path):
+        return NO_TEXT
+    if not is_stored(path):
+        return NOT_STORED
     if path.is_dir():
         return UNKNOWN_FOLDER if entries(path) else None
     if depth < 2:

@@ -16,6 +16,7 @@ from markupsafe import Markup
 
 import fieldcal
 from fieldcal.names import DriftStatus, Status, Verdict
+from fieldcal.words.printable import printable
 
 GOOD: tuple[str, ...] = (Status.OK, DriftStatus.STABLE)
 LOOK: tuple[str, ...] = (Verdict.PARTIAL, DriftStatus.DRIFTING, Status.REFUSED, DriftStatus.OUTLIER, "expired")
@@ -151,10 +152,16 @@ def _environment() -> Environment:
     return Environment(
         loader=PackageLoader("fieldcal.report"),
         autoescape=True,
+        finalize=_shown,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+
+
+def _shown(value: object) -> object:
+    """What a template puts out: names from logs without what is invisible or turns the line around."""
+    return printable(value, keep="\n\t") if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 @cache

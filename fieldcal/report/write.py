@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fieldcal.report.links import FLEET, Links, flight_name, vehicle_name
 from fieldcal.report.page import Page, html
+from fieldcal.warehouse.checksums import recording
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import prepare
 
@@ -120,8 +122,10 @@ def _place(root: Path, name: str) -> Path:
 
 def _write(path: Path, page: Page) -> Path:
     data = html(page).encode("utf-8")
+    recorded = None
     if path.parent.name == FOLDER:
         prepare(path.parent.parent)
+        recorded = partial(recording, path.parent.parent, path, dispensable=True)
     if not path.is_file() or path.read_bytes() != data:
-        write_bytes(path, data)
+        write_bytes(path, data, recorded)
     return path

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sys
 
+from fieldcal.words.printable import printable
+
 
 def say(sentence: str) -> None:
-    """Talk: to stderr."""
-    print(sentence, file=sys.stderr, flush=True)
+    """Talk: to stderr, in one line."""
+    print(printable(sentence), file=sys.stderr, flush=True)

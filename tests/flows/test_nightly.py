@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,13 @@ import polars as pl
 import pytest
 from older_history import age
 
+from fieldcal.batch.documents import Batch
+from fieldcal.batch.flights import flights
 from fieldcal.batch.outcome import Outcome
 from fieldcal.batch.steps import STEPS
 from fieldcal.cli.main import run
 from fieldcal.flows.run import dry_run, run_night
+from fieldcal.flows.runners import Answers
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.stages.pipeline import PIPELINE
@@ -225,7 +229,14 @@ def test_a_stage_that_breaks_costs_its_flight_alone(
     lengths = Warehouse(warehouse).scan("flight").select("n_samples").collect()["n_samples"].to_list()
     odd = lengths[0] % 2
     struck = sum(length % 2 == odd for length in lengths)
+
+    def here(number: int, inputs: Sequence[Batch], ahead: object = None) -> Answers:
+        """Batches in this process, where the stage is broken."""
+        for given in inputs:
+            yield given, flights(given["root"], given["source"], given["jobs"], given["code"])
+
     monkeypatch.setattr(steps, "run_stage", broken)
+    monkeypatch.setattr("fieldcal.flows.nightly.process_answers", here)
     result = run_night(archive, warehouse, None, None, 1)
     assert (result["partial"], result["ok"]) == (struck, 2 - struck)
     failed = Warehouse(warehouse).scan("run").filter(pl.col("status") == "failed").collect()

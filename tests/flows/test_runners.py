@@ -137,11 +137,11 @@ def test_batches_hold_every_job_once_and_shrink(n_jobs: int, workers: int) -> No
         assert sizes[-1] <= 4
 
 
-def test_small_nights_stay_in_this_process() -> None:
-    assert Parallel(1).in_this_process(50)
-    assert Parallel(4).in_this_process(1)
-    assert not Parallel(2).in_this_process(2)
-    assert not Parallel(1, "dask").in_this_process(1)
+def test_no_log_runs_in_this_process_and_no_process_starts_for_nothing() -> None:
+    assert Parallel(1).spawned(50) == 1
+    assert Parallel(4).spawned(1) == 1
+    assert Parallel(2).spawned(2) == 2
+    assert Parallel(2).spawned(0) == Parallel(1, "dask").spawned(1) == 0
 
 
 def test_an_answer_of_the_pool_is_read_once_and_whole(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from fieldcal.names import PREFERRED_METHODS, SENSORS, VECTOR_SENSORS, Method
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.stages.vector_triads import ELLIPSOID_METHOD
-from fieldcal.warehouse.view_text import view_text
+from fieldcal.warehouse.views import view_text
 
 
 def test_every_reason_code_has_its_meaning_and_its_name() -> None:

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from fieldcal.warehouse import view_text
+from fieldcal.warehouse import views as view_text
 from fieldcal.warehouse.sql import VIEWS
 
 

@@ -39,6 +39,7 @@ FINE_CUTOFF_HZ, FINE_SIDE_S = 8.0, 0.5
 SLOWER_CUTOFF_HZ, SLOWER_SIDE_S, SLOWER_RATE_HZ, FEWEST_SLOWER = 2.0, 1.5, 40.0, 200
 REGRESSION_ROUNDS = 3  # of reweighting, at each step of the clock
 STEADY_S = 1.0  # over which the residual's size is taken for the same
+LARGEST_GRID_PER_SAMPLE, SHORT_GRID = 50, 100_000  # of the grids that one clock alone lies on
 # Chance peaks of unrelated motions reach 0.9 in the coarse correlation; the vector fit tells them apart.
 MOST_GRID_PER_SAMPLE = 20  # a grid over hours of which minutes were recorded fills the memory with gaps
 MIN_EXPLAINED, MAX_SKEW_PPM, MAX_LAG_SD_S = 0.6, 2000.0, 0.01
@@ -159,9 +160,9 @@ def _deviation(before: Array, it: Array, after: Array, t: Array) -> Array:
 def vps_rates(t: ArrayLike, q: ArrayLike, interval_s: float, *, max_gap_s: float = 0.05) -> UniformRates:
     """Body rates from VPS attitudes (n, 4) at stamps t (n,), on a uniform grid; gaps are masked, never crossed.
 
-    SLERP to the grid, local smoothed differentiation, ω = 2Ξᵀq̇."""
+    SLERP to the grid, local smoothed differentiation, ω = 2Ξᵀq̇. Raises UnusableFlight (`gaps`) as `_grid`."""
     t, q = np.asarray(t, dtype=float), continuous(q)
-    grid = t[0] + interval_s * np.arange(int((t[-1] - t[0]) / interval_s))
+    grid = _grid(t, interval_s)
     on_grid = slerp(t, q, grid) if np.median(np.diff(t)) <= SLOW_POSE_S else cubic(t, q, grid)
     i = interval_of(t, grid)
     valid = (t[i + 1] - t[i]) <= max_gap_s
@@ -169,6 +170,25 @@ def vps_rates(t: ArrayLike, q: ArrayLike, interval_s: float, *, max_gap_s: float
     spoiled = np.convolve(~valid, np.ones(9), mode="same") > 0
     rate = body_rate(on_grid, differentiate(on_grid, interval_s))
     return UniformRates(float(t[0]), interval_s, rate, ~spoiled)
+
+
+def _grid(t: Array, interval_s: float) -> Array:
+    """Even times from the first of the stamps t to the last.
+
+    Raises
+    ------
+    UnusableFlight
+        `gaps`: far more of them than stamps; a grid over years of which seconds were recorded fills the memory.
+    """
+    span_s = float(t[-1] - t[0])
+    if span_s > interval_s * LARGEST_GRID_PER_SAMPLE * max(len(t), SHORT_GRID):
+        raise UnusableFlight(
+            ReasonCode.GAPS,
+            f"The stamps span {span_s:.0f} s, of which little was recorded: the pauses are too long for even steps of "
+            f"{interval_s:g} s. Split the log there.",
+            {"span_s": span_s},
+        )
+    return np.asarray(t[0] + interval_s * np.arange(int(span_s / interval_s)))
 
 
 def cubic(t: Array, q: Array, at: Array) -> Array:
@@ -181,7 +201,7 @@ def cubic(t: Array, q: Array, at: Array) -> Array:
 def imu_rates(t: ArrayLike, rate: ArrayLike, interval_s: float, *, max_gap_s: float = 0.1) -> UniformRates:
     """IMU rates (n, 3) at stamps t (n,) on a uniform grid, linear in between; gaps masked."""
     t, rate = np.asarray(t, dtype=float), np.asarray(rate, dtype=float)
-    grid = t[0] + interval_s * np.arange(int((t[-1] - t[0]) / interval_s))
+    grid = _grid(t, interval_s)
     i = interval_of(t, grid)
     valid = (t[i + 1] - t[i]) <= max_gap_s
     on_grid = np.stack([np.interp(grid, t, column) for column in rate.T], axis=1)

@@ -14,11 +14,16 @@ from fieldcal.reason_codes import ReasonCode
 SEPARATORS = ("\t", ";", ",")
 WHITESPACE = " "
 QUOTE = '"'
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$|[+-]?(nan|inf|infinity)$", re.IGNORECASE)
+_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?$|[+-]?(nan|inf|infinity)$", re.IGNORECASE)
 COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?$")
 _SEPARATOR_LINE = re.compile(r'"?sep=([,;\t|])"?$', re.IGNORECASE)
 _LINES_LOOKED_AT = 50
 _PREAMBLE_LINES_CAP = 1000
+_NO_ROWS_ABOVE = re.compile(rb"(?:[ \t]*(?:(?:#|//)[^\n]*)?\n)*+")
+_COMMENTS_KEPT = 200
+"""Of those above the header the last so many: one may name the columns."""
+NAME_CAP = 200
+"""Longer names of columns are cut: what is looked for in one takes the square of its length."""
 COMMENTS = ("#", "//")
 COLUMNS_CAP = 10_000
 HEADERS_BELOW = (("Format Version,", "Frame,Time"),)
@@ -74,7 +79,8 @@ def find_dialect(block: bytes, log_name: str, separator: str | None, decimal: st
     UnreadableLog
         `missing_header`, `not_text`, `no_rows`, `too_many_columns`.
     """
-    lines = block.split(b"\n", _PREAMBLE_LINES_CAP)[:_PREAMBLE_LINES_CAP]
+    passed = max(0, comment_lines(block) - _COMMENTS_KEPT)
+    lines = block.split(b"\n", passed + _PREAMBLE_LINES_CAP)[passed : passed + _PREAMBLE_LINES_CAP]
     texts = [line_text(line) for line in lines]
     body = [number for number, text in enumerate(texts) if text.strip() and not text.lstrip().startswith(COMMENTS)]
     if not body:
@@ -114,7 +120,14 @@ def find_dialect(block: bytes, log_name: str, separator: str | None, decimal: st
         cells = cells_of(data[0], found)
         if len(cells) == len(names) and is_units_row(cells):
             unit_row, first_row = tuple(cells), body[1] + 1
-    return Dialect(found, point, tuple(names), header, unit_row, first_row, preamble, place + 1)
+    names = [name[:NAME_CAP] for name in names]
+    return Dialect(found, point, tuple(names), header, unit_row, passed + first_row, preamble, passed + place + 1)
+
+
+def comment_lines(block: bytes) -> int:
+    """How many lines, empty or comments, stand above all others."""
+    above = _NO_ROWS_ABOVE.match(block)
+    return above[0].count(b"\n") if above else 0
 
 
 def header_place(texts: list[str], separator: str | None, decimal: str | None) -> int:

@@ -12,6 +12,8 @@ from fieldcal.logs.interface import Finding
 from fieldcal.reason_codes import ReasonCode
 
 _TIMES_READ = "times are numbers, ISO 8601 or HH:MM:SS with or without a fraction"
+_SHOWN = 60
+"""Characters of a cell that a sentence shows."""
 _SENTENCES = {
     ReasonCode.RAGGED_ROW: ("have more or fewer fields than the header and were left out", True),
     ReasonCode.NUL_BYTES: ("contain NUL bytes and were left out", True),
@@ -53,5 +55,6 @@ class Losses:
             words, loses_data = _SENTENCES[reason]
             told = f"{name}: {count} row(s) {words}; the first is line {self.first_lines[reason]}."
             if reason == ReasonCode.BAD_TIME and bad_time is not None:
-                told += f" {bad_time!r} is none: {_TIMES_READ}."
+                shown = bad_time if len(bad_time) <= _SHOWN else f"{bad_time[:_SHOWN]}…"
+                told += f" {shown!r} is none: {_TIMES_READ}."
             yield Finding(reason, count, told, loses_data=loses_data)

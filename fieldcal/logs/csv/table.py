@@ -15,7 +15,7 @@ from fieldcal.errors import UnreadableLog
 from fieldcal.logs.csv import columns as columns_of
 from fieldcal.logs.csv import conversion, instances
 from fieldcal.logs.csv.clock import FileClock
-from fieldcal.logs.csv.dialect import cells_of, find_dialect
+from fieldcal.logs.csv.dialect import cells_of, comment_lines, find_dialect
 from fieldcal.logs.csv.losses import Losses
 from fieldcal.logs.csv.presets.choice import only_by_name, read_as
 from fieldcal.logs.csv.presets.layout import ATTITUDES, layout_of
@@ -29,6 +29,7 @@ from fieldcal.logs.interface import Columns as BatchColumns
 from fieldcal.logs.joining import INERTIAL, SensorJoin, stand_apart
 from fieldcal.reason_codes import ReasonCode
 
+_HEAD_CAP_BYTES = 64 << 20
 _LINES_LOOKED_AT, _ROWS_LOOKED_AT = 50, 5000
 
 
@@ -62,7 +63,7 @@ class CsvTable:
         self._summary = summary
         self._csv = vehicle.csv
         self._blocks = LineBlocks(path)
-        first = next(iter(self._blocks), b"")
+        first = self._head()
         self.dialect = find_dialect(first, self._name, self._csv.separator, self._csv.decimal)
         self._first_cells = self._cells_of_first_row(first)
         layout = layout_of(first, self.dialect, self._first_cells)
@@ -100,12 +101,21 @@ class CsvTable:
         self._joins_itself = join is None
         self._join = SensorJoin() if join is None and self._sensors_stand_apart(first) else join
 
+    def _head(self) -> bytes:
+        """The file's first block, with those behind it for as long as they hold nothing but comments."""
+        head = b""
+        for block in self._blocks:
+            head += block
+            if comment_lines(head) < head.count(b"\n") or len(head) > _HEAD_CAP_BYTES:
+                break
+        return head
+
     def batches(self) -> Iterator[Batch]:
         """Signal batches, block by block."""
         losses = Losses()
         line, row = 1, 0
         skip = self.dialect.first_row
-        for number, block in enumerate(self._blocks):
+        for block in self._blocks:
             lines = block.count(b"\n")
             if skip:
                 passed = min(skip, lines)
@@ -117,7 +127,7 @@ class CsvTable:
                 continue
             losses.next_block()
             frame, numbers = read_rows(block, self.dialect, line, self._wanted(), losses)
-            if number == 0 and losses.counts.get(ReasonCode.RAGGED_ROW, 0) > len(numbers):
+            if row == 0 and losses.counts.get(ReasonCode.RAGGED_ROW, 0) > len(numbers):
                 raise UnreadableLog(
                     ReasonCode.RAGGED_ROWS,
                     f"{self._name}: most rows have not the {self.dialect.fields} fields of the header (first at line "

@@ -16,6 +16,8 @@ _ISO = r"^(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d+))?\s*(Z|z|[+-]\d\d:?\
 _TIME_OF_DAY = r"^(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d+))?$"
 _CLOCK_PARTS = ((1, "hours"), (2, "minutes"), (3, "seconds"))
 _LARGEST = 2**63 - 1
+_LONGEST_TIME = 100
+"""Characters of a time with an exponent: the exact value takes the square of their number."""
 
 
 def looks_iso8601(text: str) -> bool:
@@ -69,7 +71,9 @@ def _from_decimal(cells: pl.Series, digits: int) -> pl.Series:
     signed = pl.when(pl.col("sign") == "-").then(-size).otherwise(size)
     result = parts.select(pl.when(usable).then(signed).otherwise(None).alias("t_ns"))["t_ns"]
     exponents = parts.select(
-        pl.col("cell").str.contains(r"^[+-]?(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}$").fill_null(False)
+        (pl.col("cell").str.len_bytes() <= _LONGEST_TIME)
+        .and_(pl.col("cell").str.contains(r"^[+-]?(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}$"))
+        .fill_null(False)
     ).to_series()
     places = exponents.arg_true()
     if len(places):

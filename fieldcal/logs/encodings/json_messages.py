@@ -20,9 +20,12 @@ from fieldcal.logs.encodings.decoded import (
 )
 from fieldcal.names import Json
 
+MESSAGE_CAP_BYTES = 1 << 20
+"""As an object JSON takes many times its length; a reading is some hundred bytes long."""
+
 
 class JsonDecoder:
-    """Reads `wants` from JSON objects. A message that lacks one, or is no JSON, is left out."""
+    """Reads `wants` from JSON objects. A message that lacks one, is too long or no JSON, is left out."""
 
     def __init__(self, wants: Mapping[str, Want]) -> None:
         self._wants = dict(wants)
@@ -32,6 +35,8 @@ class JsonDecoder:
         return decode_each(self._read, self._wants, data, starts, sizes)
 
     def _read(self, payload: bytes) -> tuple[int | None, list[list[float]]]:
+        if len(payload) > MESSAGE_CAP_BYTES:
+            raise ValueError("too long for a reading")
         message: Json = json.loads(payload)
         return _stamp(message), [_numbers(message, want) for want in self._wants.values()]
 

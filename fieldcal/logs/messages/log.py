@@ -24,6 +24,8 @@ from fieldcal.reason_codes import ReasonCode
 
 SI_UNITS = {"gyroscope": "rad/s", "accelerometer": "m/s^2", "magnetometer": "T"}
 CHANNELS_CAP = 4096
+MESSAGES_AT_ONCE = 20_000
+"""A chunk of 1 MiB holds some thousand; one that unpacks to far more is not to be decoded all at once."""
 
 
 class MessageLog:
@@ -70,7 +72,7 @@ class MessageLog:
     def batches(self) -> Iterator[Batch]:
         """Signal batches in file order, one per topic and chunk. May be iterated once."""
         wanted = frozenset(channel_id for source in self._sources for channel_id in source.decoders)
-        for block in self._container.blocks(wanted):
+        for block in _pieces(self._container.blocks(wanted)):
             for source in self._sources:
                 for channel_id, decoder in source.decoders.items():
                     for frame, some in self._by_unit(source, _of_channel(block, channel_id)):
@@ -196,6 +198,17 @@ def _named(source: Source, frame: str) -> tuple[str, str]:
     if frame:
         return f"{source.topic} ({frame})", f"{source.topic}:{frame}"
     return source.topic, source.topic if source.further else ""
+
+
+def _pieces(blocks: Iterator[Block]) -> Iterator[Block]:
+    """The same messages, at most `MESSAGES_AT_ONCE` in a block."""
+    for block in blocks:
+        if len(block.starts) <= MESSAGES_AT_ONCE:
+            yield block
+            continue
+        places = np.arange(len(block.starts))
+        for first in range(0, len(places), MESSAGES_AT_ONCE):
+            yield block.of((places >= first) & (places < first + MESSAGES_AT_ONCE))
 
 
 def _of_channel(block: Block, channel_id: int) -> Block:

@@ -20,5 +20,5 @@ VALUES = {
 
 def view_text(name: str) -> str:
     """The statement that makes a view. Raises KeyError where its file has a placeholder that `VALUES` lacks."""
-    text = (files("fieldcal.warehouse") / "views" / f"{name}.sql").read_text(encoding="utf-8")
+    text = (files(__package__) / f"{name}.sql").read_text(encoding="utf-8")
     return text.format_map(VALUES)

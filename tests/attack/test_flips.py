@@ -1,0 +1,118 @@
+"""A flipped bit, wherever it lies: `verify` finds it, and no reader gives altered numbers."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from fieldcal.batch.closing import close_night
+from fieldcal.batch.flights import flights
+from fieldcal.batch.night import plan_night, publishings
+from fieldcal.batch.outcome import Outcome
+from fieldcal.provenance.run_key import code_digest
+from fieldcal.simulation.archive import write_flights
+from fieldcal.simulation.experiment import Experiment
+from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.errors import WarehouseError
+from fieldcal.warehouse.layout import checksum_path
+from fieldcal.warehouse.publish import read_history
+from fieldcal.warehouse.signals import read_signal
+from fieldcal.warehouse.verify import verify
+
+FLIPS = 60
+PLACES = ("tables", "signals", "stages", "reports", "night", "checksums")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A night's warehouse, made without Prefect."""
+    folder = tmp_path_factory.mktemp("flips")
+    write_flights(folder / "archive", Experiment(seed=3, duration_s=20.0, sets=1))
+    root = folder / "warehouse"
+    night = plan_night(folder / "archive", root)
+    answer = flights(str(root), night.source, [job.plain() for job in night.missing()], code_digest())
+    for publishing in publishings(night, [Outcome.of(plain) for plain in answer["outcomes"]]):
+        publishing.publish()
+    close_night(root, night.configuration.alerts)
+    plan_night(folder / "archive", root)
+    assert verify(root)["ok"]
+    return root
+
+
+def flipped(path: Path, rng: np.random.Generator) -> bytes:
+    """The file with one bit turned; what it held."""
+    before = path.read_bytes()
+    data = bytearray(before)
+    data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
+    path.write_bytes(bytes(data))
+    return before
+
+
+def test_verify_finds_every_flip_in_every_kind_of_file(root: Path) -> None:
+    kept = {place: [p for p in sorted((root / place).rglob("*")) if p.is_file()] for place in PLACES}
+    assert all(kept.values())
+    assert any(path.suffix == ".npz" for path in kept["night"])
+    rng = np.random.default_rng(17)
+    missed: Counter[str] = Counter()
+    for number in range(FLIPS):
+        place = PLACES[number % len(PLACES)]
+        path = kept[place][int(rng.integers(len(kept[place])))]
+        before = flipped(path, rng)
+        if verify(root)["ok"]:
+            missed[str(path.relative_to(root))] += 1
+        path.write_bytes(before)
+    assert missed == {}
+    assert verify(root)["ok"]
+
+
+@pytest.mark.parametrize("table", ["calibration", "flight", "imu"])
+def test_no_reader_believes_a_flip(root: Path, table: str) -> None:
+    warehouse = Warehouse(root)
+    ((flight_id, vehicle_id),) = warehouse.scan("flight").select("flight_id", "vehicle_id").collect().iter_rows()
+    (path,) = (root / ("signals" if table == "imu" else "tables") / table).glob("*/*.parquet")
+    readers = {"scan": lambda: warehouse.scan(table).collect()}
+    if table == "imu":
+        readers["signal"] = lambda: read_signal(root, table, vehicle_id, flight_id)
+    else:
+        readers["sql"] = lambda: warehouse.sql(f"SELECT * FROM {table}")
+        readers["history"] = lambda: read_history(root, table, vehicle_id)
+    rng = np.random.default_rng(4)
+    for _ in range(30):
+        before = flipped(path, rng)
+        for name, read in readers.items():
+            with pytest.raises(WarehouseError, match=path.name) as caught:
+                pytest.fail(f"{name} gave {read()}")
+            assert caught.value.reason_code == "damaged_file"
+        path.write_bytes(before)
+    for read in readers.values():
+        assert read().height
+
+
+def test_without_a_record_the_file_is_read_and_a_panic_is_a_sentence(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (path,) = (root / "tables" / "flight").glob("*/*.parquet")
+    record = checksum_path(root, path)
+    before = record.read_bytes()
+    record.write_bytes(b"torn")
+    assert Warehouse(root).scan("flight").collect().height == 1
+    record.write_bytes(before)
+
+    def panics(*_: object, **__: object) -> None:
+        raise pl.exceptions.PanicException("unwrap on None")
+
+    monkeypatch.setattr("fieldcal.warehouse.store.pq.ParquetFile", panics)
+    with pytest.raises(WarehouseError, match=r"part\.parquet is damaged \(unwrap on None\)"):
+        read_history(root, "flight", path.parent.name.removeprefix("vehicle_id="))
+
+
+def test_a_report_may_be_deleted(root: Path) -> None:
+    for report in (root / "reports").iterdir():
+        assert len(json.loads(checksum_path(root, report).read_bytes())["sha256"]) == 2
+        report.unlink()
+    assert verify(root)["ok"]
