@@ -76,11 +76,19 @@ def _read_motive(layout: Layout, *, y_up: bool) -> Meaning | str:
     )
 
 
-MOTIVE = Preset("motive", "OptiTrack Motive's", "vps", lambda layout: _read_motive(layout, y_up=True))
+def _read_motive_y_up(layout: Layout) -> Meaning | str:
+    return _read_motive(layout, y_up=True)
+
+
+def _read_motive_z_up(layout: Layout) -> Meaning | str:
+    return _read_motive(layout, y_up=False)
+
+
+MOTIVE = Preset("motive", "OptiTrack Motive's", "vps", _read_motive_y_up)
 """Format versions 1.2x, whose first line gives units and rotation type. Times in s from the take's start. Quaternions
 are scalar last, body to world, in Motive's right-handed world with y up; its axes may be chosen at export, which the
 file does not say."""
-MOTIVE_Z_UP = Preset("motive_z_up", "OptiTrack Motive's", "vps", lambda layout: _read_motive(layout, y_up=False))
+MOTIVE_Z_UP = Preset("motive_z_up", "OptiTrack Motive's", "vps", _read_motive_z_up)
 """The same, exported with z up; never chosen by itself."""
 
 
