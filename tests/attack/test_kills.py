@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from outside_ci import outside_ci
 
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
@@ -80,6 +81,7 @@ def some_stage(root: Path) -> bool:
     return any((root / "stages").glob("*/*/*/run.json"))
 
 
+@outside_ci
 def test_a_night_behind_a_proxy_ends_without_its_first_worker_and_without_its_server(
     archive: Path, tmp_path: Path
 ) -> None:
@@ -100,6 +102,7 @@ def test_a_night_behind_a_proxy_ends_without_its_first_worker_and_without_its_se
     assert verify(tmp_path)["ok"]
 
 
+@outside_ci
 def test_a_killed_night_leaves_nobody_behind(archive: Path, tmp_path: Path) -> None:
     process = night(archive, tmp_path)
     wait_for(process, lambda: some_stage(tmp_path))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from outside_ci import outside_ci
 
 from fieldcal.batch import watchdog
 from fieldcal.batch.limits import why_ended
@@ -98,6 +99,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@outside_ci
 def test_a_night_goes_on_without_the_log_that_takes_too_much_and_remembers_it(
     archive: Path, tmp_path: Path, prefect_server: str
 ) -> None:

@@ -20,6 +20,7 @@ from typing import Any
 from uuid import uuid4
 
 import pytest
+from outside_ci import outside_ci
 
 from fieldcal.batch.session_folder import archive_of
 from fieldcal.errors import FieldcalError
@@ -375,6 +376,7 @@ def test_a_stale_secret_is_one_sentence(place: Path, served: Path) -> None:
     assert "of-yesterday" not in "".join(told)
 
 
+@outside_ci
 def test_serve_leaves_nobody_behind_when_it_is_killed(place: Path, served: Path) -> None:
     from prefect.client.orchestration import get_client
 
@@ -408,6 +410,7 @@ def parent(pid: int) -> int | None:
     return None if state == "Z" else int(ppid)
 
 
+@outside_ci
 def test_nobody_else_gives_work_to_a_dask_cluster_of_ours() -> None:
     from distributed import Client, LocalCluster
 
