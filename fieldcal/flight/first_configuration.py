@@ -89,9 +89,6 @@ def _there_already(path: Path) -> FieldcalError:
 def _vehicle_table(vehicle_id: str, logs: list[LogFile], configuration: Configuration) -> Iterator[str]:
     formats = ", ".join(f"{count} {kind}" for kind, count in sorted(Counter(log.log_format for log in logs).items()))
     header = f"{vehicle_header(vehicle_id)}  # logs: {formats}"
-    if not _is_text(vehicle_id):
-        yield f"# A vehicle whose folder's name is no UTF-8 cannot be named here; rename the folder. Logs: {formats}\n"
-        return
     yield header
     tried = logs[:MOST_LOGS_TRIED]
     for log in tried:

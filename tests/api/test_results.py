@@ -123,7 +123,7 @@ def test_a_sensor_without_numbers_says_what_it_lacked(refused: fieldcal.Calibrat
 
 def test_constants_leave_refused_sensors_out(refused: fieldcal.Calibration) -> None:
     assert set(refused.constants().triads) == {"accelerometer"}
-    assert "CAL_MAG0" not in fieldcal.export(refused, "px4").text
+    assert "magnetometer" not in fieldcal.export(refused, "c").text
 
 
 def test_an_axis_that_was_not_refused_can_be_asked_for() -> None:

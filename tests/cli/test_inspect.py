@@ -247,13 +247,13 @@ def test_init_bears_hostile_names_and_logs_that_cannot_be_read(
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names of files are UTF-8 there")
 def test_init_bears_names_that_are_no_text(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    for place in (b"v/s/log\xff.mcap", b"\xff/s/log.mcap", b"v/s/deeper\xff/log.mcap"):
+    for place in (b"v/s/log.mcap", b"v/s/log\xff.mcap", b"\xff/s/log.mcap", b"v/s/deeper\xff/log.mcap"):
         path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + place))
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     told = shown(capsys, "init", str(tmp_path))
     assert load(tmp_path / CONFIG_NAME).vehicles == ("v",)
-    assert told.count("rename") == 2
+    assert "rename them: 3 logs" in told
 
 
 def test_a_date_that_no_field_model_covers_is_told(tmp_path: Path) -> None:

@@ -336,7 +336,8 @@ def test_two_imus_in_one_file_are_refused_or_split(tmp_path: Path) -> None:
     for chosen in (0, 1):
         frames, summary = read(tmp_path, two_imus(), vehicle(csv=CsvMap(instance=str(chosen))))
         assert frames["imu"]["gyroscope_x"].to_list() == [10 * chosen + i for i in range(chosen, 60, 2)]
-        assert codes(summary) == []
+        assert frames["imu.1"]["gyroscope_x"].to_list() == [10 * (1 - chosen) + i for i in range(1 - chosen, 60, 2)]
+        assert codes(summary) == ["further_units"]
     csv = CsvMap(instance="1", imu={"instance": "which"})
     frames, _ = read(tmp_path, two_imus("which"), vehicle(csv=csv))
     assert len(frames["imu"]) == 30

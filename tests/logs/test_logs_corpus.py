@@ -22,7 +22,7 @@ from fieldcal.logs.ingest import read_flight
 
 MOST_MB = 512
 MOST_SECONDS = 10.0
-FLIPS = 800 if os.environ.get("CI") else 2000
+FLIPS = 300 if os.environ.get("CI") else 2000
 VERDICTS = ("ok", "partial", "quarantined", "rejected")
 SUPPORT = Path(__file__).parents[1]
 

@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 import what_reruns
 from drift_history import publish_fleet
+from outside_ci import outside_ci
 
 import fieldcal
 from fieldcal.config.configuration import load
@@ -235,7 +236,14 @@ def source_of(module: str) -> str:
     return Path(str(importlib.import_module(module).__file__)).read_text()
 
 
-@pytest.mark.parametrize("module", [ROTATION, "fieldcal.geometry.sensor_model", "fieldcal.stages.tables"])
+@pytest.mark.parametrize(
+    "module",
+    [
+        pytest.param(ROTATION, marks=outside_ci),
+        pytest.param("fieldcal.geometry.sensor_model", marks=outside_ci),
+        "fieldcal.stages.tables",
+    ],
+)
 def test_each_definition_in_turn_concerns_those_that_name_it(module: str) -> None:
     named = {step: named_in(function) for step, function in FUNCTIONS.items()}
     text = source_of(module)

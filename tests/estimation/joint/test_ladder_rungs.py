@@ -46,7 +46,15 @@ class Climbed:
             raise UnusableFlight(ReasonCode.NO_START, f"unprepared {len(self.prepared)}")
         return len(self.prepared), SimpleNamespace(q=self.q)
 
-    def fit(self, model: Any, state: Any, *, try_lever_arm: bool, priors: Mapping[str, PriorConstants]) -> Any:
+    def fit(
+        self,
+        model: Any,
+        state: Any,
+        *,
+        try_lever_arm: bool,
+        priors: Mapping[str, PriorConstants],
+        doubt_lever_arm: bool = True,
+    ) -> Any:
         self.asked.append({"model": model, "arm": try_lever_arm, "priors": priors})
         if len(self.asked) in self.failing:
             raise EstimationError(ReasonCode.JOINT_DIVERGED, f"fit {len(self.asked)}")
