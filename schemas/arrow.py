@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import pyarrow as pa
 
 from fieldcal.schemas.column import AS_LOGGED
-from fieldcal.schemas.columns import IS_PRIMARY, UNIT_ID
-from fieldcal.schemas.rows import may_be_null
+from fieldcal.schemas.rows import IN_OLDER_ROWS, may_be_null
 from fieldcal.schemas.tables import TABLES, table_columns, table_key
 
 TABLE_KEY = "fieldcal.table"
@@ -58,8 +57,7 @@ def arrow_schema(
 
 
 def check(schema: pa.Schema, table: str, *, stage: bool = False) -> tuple[str, ...]:
-    """Columns that a file lacks because an older version wrote it. Its rows have null there; of the columns that tell
-    units apart, the one unit that there was then (`schemas.rows.UNIT_OF_OLDER_ROWS`).
+    """Columns that a file lacks because an older version wrote it. What its rows have there: `rows.IN_OLDER_ROWS`.
 
     Raises
     ------
@@ -102,7 +100,7 @@ def _dispensable(table: str) -> frozenset[str]:
     """Columns that rows of an older version may lack. A stage's own tables are made anew with its code."""
     definition = TABLES[table]
     if definition.kind == "history":
-        return may_be_null(table) | {UNIT_ID.name, IS_PRIMARY.name}
+        return may_be_null(table) | IN_OLDER_ROWS.keys()
     return frozenset(definition.column_names) - {*definition.key} if definition.kind == "signal" else frozenset()
 
 

@@ -150,7 +150,7 @@ FLIGHT_ID = Column(
     "",
     "first 16 hex digits of the sha256 of the log's content: the same log is the same flight wherever it lies",
 )
-VEHICLE_ID = Column("vehicle_id", _TEXT, "", "vehicle that flew (`drift`: the latest one that carried the IMU)")
+VEHICLE_ID = Column("vehicle_id", _TEXT, "", "vehicle that flew (`drift`: the latest one that carried the unit)")
 IMU_ID = Column("imu_id", _TEXT, "", "inertial unit on board; the vehicle's id where no other is configured")
 UNIT_ID = Column(
     "unit_id",
@@ -349,5 +349,5 @@ FLEET_Z = Column(
     "fleet_z",
     _F64,
     "1",
-    "distance from the fleet's other IMUs, in sd; of a VPS lag: of its scatter's logarithm; null with few siblings",
+    "distance from the fleet's other units, in sd; of a VPS lag: of its scatter's logarithm; null with few siblings",
 )

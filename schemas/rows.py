@@ -199,8 +199,9 @@ ROWS = {
 }
 
 
-UNIT_OF_OLDER_ROWS = "imu_id"
-"""Rows of a version without `unit_id` are of the one unit that a flight had then, the primary one: its imu_id."""
+IN_OLDER_ROWS: Mapping[str, str | bool] = {"unit_id": "imu_id", "is_primary": True}
+"""What rows of a version without these columns have in them, the one unit that a flight had then: of a text, what the
+column of this name has. In other columns that they lack they have null."""
 
 
 def may_be_null(table: str) -> frozenset[str]:

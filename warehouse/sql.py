@@ -25,8 +25,7 @@ import pyarrow as pa
 from fieldcal import schemas
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import HISTORY_TABLES
-from fieldcal.schemas.columns import IS_PRIMARY, UNIT_ID
-from fieldcal.schemas.rows import UNIT_OF_OLDER_ROWS
+from fieldcal.schemas.rows import IN_OLDER_ROWS
 from fieldcal.warehouse.checksums import assure
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.layout import history_files, vehicle_of
@@ -153,11 +152,11 @@ def _select(table: str, paths: Sequence[Path], absent: Collection[str]) -> str:
 
 def _younger(table: str, name: str) -> str:
     """What rows of an older version have in a column that they lack (`schemas.check`)."""
-    if name == UNIT_ID.name:
-        return f'f."{UNIT_OF_OLDER_ROWS}" AS "{name}"'
-    if name == IS_PRIMARY.name:
-        return f'TRUE AS "{name}"'
-    return f'CAST(NULL AS {_sql_type(schemas.arrow_schema(table).field(name))}) AS "{name}"'
+    has = IN_OLDER_ROWS.get(name)
+    if isinstance(has, str):
+        return f'f."{has}" AS "{name}"'
+    value = "NULL" if has is None else str(has)
+    return f'CAST({value} AS {_sql_type(schemas.arrow_schema(table).field(name))}) AS "{name}"'
 
 
 def _listed(paths: Sequence[Path]) -> str:

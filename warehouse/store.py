@@ -22,8 +22,7 @@ from fieldcal import schemas
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import SchemaMismatch
 from fieldcal.schemas.arrow import VERSION_KEY
-from fieldcal.schemas.columns import IS_PRIMARY, UNIT_ID
-from fieldcal.schemas.rows import UNIT_OF_OLDER_ROWS
+from fieldcal.schemas.rows import IN_OLDER_ROWS
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import AroundRename, AtomicFile, write_bytes
 
@@ -164,7 +163,7 @@ def table_bytes(data: Data, table: str) -> bytes:
 
 
 def read_table(path: Path, table: str, *, stage: bool = False) -> pl.DataFrame:
-    """Read a table, verifying page checksums and schema. Columns that an older version did not have are null.
+    """Read a table, verifying page checksums and schema. Columns that an older version did not have: `schemas.check`.
 
     Raises
     ------
@@ -185,7 +184,7 @@ def read_arrow(source: Path | bytes, table: str, *, stage: bool = False, name: s
             absent = schemas.check(file.schema_arrow, table, stage=stage)
             rows = file.read(columns=[name for name in _names(table, stage) if name not in absent])
             rows.validate(full=True)
-            return _with_nulls(rows, absent, table, stage)
+            return _completed(rows, absent, table, stage)
     except SchemaMismatch as error:
         raise WarehouseError(ReasonCode.SCHEMA_MISMATCH, f"{shown}: {error}.") from error
     except (pa.ArrowException, pl.exceptions.PanicException, OSError, ValueError) as error:
@@ -253,17 +252,13 @@ def _arrow(data: Data) -> pa.Table:
     return pa.table({name: pa.array(np.ascontiguousarray(column)) for name, column in data.items()})
 
 
-def _with_nulls(rows: pa.Table, absent: Collection[str], table: str, stage: bool) -> pa.Table:
+def _completed(rows: pa.Table, absent: Collection[str], table: str, stage: bool) -> pa.Table:
     """The rows with the columns that they lack (`schemas.check`), in the table's order."""
     schema = schemas.arrow_schema(table, stage=stage)
     for name in absent:
+        has = IN_OLDER_ROWS.get(name)
         kind = schema.field(name).type
-        if name == UNIT_ID.name:
-            values = rows[UNIT_OF_OLDER_ROWS]
-        elif name == IS_PRIMARY.name:
-            values = pa.repeat(pa.scalar(True, kind), rows.num_rows)
-        else:
-            values = pa.nulls(rows.num_rows, kind)
+        values = rows[has] if isinstance(has, str) else pa.repeat(pa.scalar(has, kind), rows.num_rows)
         rows = rows.append_column(schema.field(name), values)
     return rows.select(schema.names)
 

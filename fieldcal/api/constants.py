@@ -69,9 +69,7 @@ def export(
         raise ValueError(f"to is one of {', '.join(FORMATS)}, not {to!r}")
     if to not in AUTOPILOTS and (parameters is not None or logged_raw):
         raise ValueError(f"parameters and logged_raw are for {' and '.join(AUTOPILOTS)}, not for {to!r}")
-    told = read_parameters(Path(parameters)) if isinstance(parameters, Path | str) else parameters
-    own = constants.constants() if isinstance(constants, Calibration) else constants
-    return export_to(to, own, Request(told, logged_raw, system_id))
+    return export_to(to, _constants(constants), Request(_parameters(parameters), logged_raw, system_id))
 
 
 def compare(
@@ -109,9 +107,7 @@ def compare(
     ...     print(error.reason_code)
     not_loadable
     """
-    told = read_parameters(Path(parameters)) if isinstance(parameters, Path | str) else parameters
-    own = constants.constants() if isinstance(constants, Calibration) else constants
-    return compared(own, Request(told, logged_raw))[0]
+    return compared(_constants(constants), Request(_parameters(parameters), logged_raw))[0]
 
 
 def apply(
@@ -161,8 +157,20 @@ def apply(
     True
     """
     recording = as_recording(log, config, vehicle)
-    own = constants.constants() if isinstance(constants, Calibration) else constants
     read = recording.source
     return apply_constants(
-        recording.path.name, read.vehicle, read.signals, read.facts, own, follow_temperature=follow_temperature
+        recording.path.name,
+        read.vehicle,
+        read.signals,
+        read.facts,
+        _constants(constants),
+        follow_temperature=follow_temperature,
     )
+
+
+def _constants(given: Constants | Calibration) -> Constants:
+    return given.constants() if isinstance(given, Calibration) else given
+
+
+def _parameters(given: Mapping[str, float] | Path | str | None) -> Mapping[str, float] | None:
+    return read_parameters(Path(given)) if isinstance(given, Path | str) else given

@@ -17,6 +17,7 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 LOOK_EVERY_S = 0.1
 _READ_BYTES = 1 << 16
@@ -51,7 +52,7 @@ def _told_by_ps(pid: int) -> tuple[float, float]:
 def watch(pid: int) -> None:
     """Watch what is told on standard input, until that ends or the process is over a limit."""
     rest = b""
-    given: dict[str, object] = {}
+    given: Any = {}
     began_s, before_s = 0.0, 0.0
     while True:
         heard = select.select([0], [], [], LOOK_EVERY_S if given else None)[0]
@@ -69,9 +70,9 @@ def watch(pid: int) -> None:
         if given:
             cpu_s, held_mb = taken(pid)
             now = {"seconds": time.monotonic() - began_s, "cpu_seconds": cpu_s - before_s, "memory_mb": held_mb}
-            for name, (most, text) in given["limits"].items():  # type: ignore[attr-defined]
+            for name, (most, text) in given["limits"].items():
                 if now[name] > most:
-                    _end(pid, Path(str(given["place"])), text)
+                    _end(pid, Path(given["place"]), text)
                     return
 
 

@@ -51,11 +51,13 @@ def export(
     output
         File to write; else stdout.
     """
-    if to not in ("px4", "ardupilot") and (params is not None or logged_raw):
-        told = f"--params and --logged-raw are for px4 and ardupilot; {to} takes the constants as they are."
-        raise fieldcal.FieldcalError(ReasonCode.WRONG_OPTION, told)
+    from fieldcal.exports import AUTOPILOTS
     from fieldcal.warehouse.files import write_bytes
     from fieldcal.words.talk import say
+
+    if to not in AUTOPILOTS and (params is not None or logged_raw):
+        told = f"--params and --logged-raw are for {' and '.join(AUTOPILOTS)}; {to} takes the constants as they are."
+        raise fieldcal.FieldcalError(ReasonCode.WRONG_OPTION, told)
 
     constants = fieldcal.Warehouse(warehouse).calibration_at(vehicle, at_temperature, unit=unit)
     result = fieldcal.export(constants, to, parameters=params, logged_raw=logged_raw, system_id=system_id)

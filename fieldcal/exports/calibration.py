@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from fieldcal.config.loaded import Loaded
 from fieldcal.geometry.rotation import Array
+from fieldcal.geometry.sensor_model import through
 from fieldcal.names import Rotation
 
 NOT_TURNED: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -23,12 +24,6 @@ NOT_TURNED: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 def cubic_about(first: Array, second: Array, third: Array, by_degc: float) -> tuple[Array, Array, Array]:
     """Coefficients of d, d² and d³ of a cubic that had these about a point `by_degc` below: c(d + by) − c(by)."""
     return first + 2.0 * second * by_degc + 3.0 * third * by_degc**2, second + 3.0 * third * by_degc, third
-
-
-def through(matrix: Array, v: Array) -> Array:
-    """matrix · v, where an unknown or infinite element of v concerns only what it has a part in."""
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(matrix == 0.0, 0.0, matrix * v).sum(axis=1))
 
 
 @dataclass(frozen=True)
@@ -83,6 +78,11 @@ class Triad:
     def diagonal(self) -> bool:
         """Whether the axes are independent: no soft iron, no cross-axis terms."""
         return bool(np.array_equal(self.scale, np.diag(np.diagonal(self.scale))))
+
+    @property
+    def follows_temperature(self) -> bool:
+        """Whether scale or zero has a slope on temperature."""
+        return bool(np.any(self.scale_per_degc != 0.0) or np.any(self.zero_per_degc != 0.0))
 
     def turned(self, turn: Array) -> Triad:
         """The same constants in other axes: of readings and results that `turn`, (3, 3) orthogonal, was applied to.

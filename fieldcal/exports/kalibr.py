@@ -65,7 +65,7 @@ def kalibr(constants: Constants) -> Export:
         if sensor == Sensor.GYROSCOPE:
             lines += ["  A:", *rows(np.zeros((3, 3)), "  "), "  C_gyro_i:", *rows(turn @ frame.T, "  ")]
         warnings.append(f"{sensor}: Kalibr estimates the bias itself; the zero is a comment only.")
-        if np.any(triad.scale_per_degc != 0.0) or np.any(triad.zero_per_degc != 0.0):
+        if triad.follows_temperature:
             warnings.append(f"{sensor}: Kalibr knows no temperature; M is that at {triad.temperature_degc:g} °C.")
     if Sensor.MAGNETOMETER in constants.triads:
         warnings.append("magnetometer: Kalibr has none; left out.")

@@ -79,7 +79,7 @@ def imu_calib(constants: Constants) -> Export:
     warnings = []
     if Sensor.GYROSCOPE in constants.triads:
         warnings.append("gyroscope: imu_calib measures its zero itself, at rest, and has no scale; left out.")
-    if np.any(triad.scale_per_degc != 0.0) or np.any(triad.zero_per_degc != 0.0):
+    if triad.follows_temperature:
         warnings.append(f"accelerometer: imu_calib knows no temperature; it is that at {triad.temperature_degc:g} °C.")
     if Sensor.MAGNETOMETER in constants.triads:
         warnings.append("magnetometer: imu_calib has none; left out.")

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from fieldcal.config.configuration import Vehicle
 from fieldcal.logs.facts import Facts
-from fieldcal.logs.on_board import PRIMARY, UNIT_TABLES
-from fieldcal.names import INERTIAL_FIRST, SENSORS, Sensor
-from fieldcal.schemas import signal_kind
+from fieldcal.logs.on_board import PRIMARY, sensors_of
+from fieldcal.names import INERTIAL_FIRST, Sensor
 from fieldcal.stages.stage import step_of
 
 
@@ -43,9 +42,7 @@ def units_of(facts: Facts, vehicle: Vehicle, imu_id: str) -> list[Unit]:
     on_board = facts["units_on_board"] or [{"table": PRIMARY, "devices": {}, "applied": {}, "loaded": {}}]
     units = []
     for one in on_board[: None if vehicle.units_on_board == "all" else 1]:
-        primary = one["table"] == PRIMARY
-        own = SENSORS if primary else UNIT_TABLES[signal_kind(one["table"])]
-        devices = {sensor: one["devices"].get(sensor) or None for sensor in own}
+        devices = {sensor: one["devices"].get(sensor) or None for sensor in sensors_of(one["table"])}
         ids = {sensor: board if device is None else f"{board}/{device}" for sensor, device in devices.items()}
         of_all = next((ids[sensor] for sensor in INERTIAL_FIRST if devices.get(sensor) is not None), board)
         units.append(Unit(one["table"], of_all, ids))

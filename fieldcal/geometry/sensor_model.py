@@ -17,6 +17,12 @@ def calibrate(logged: ArrayLike, scale: ArrayLike, bias: ArrayLike) -> Array:
     return (z * scale if scale.ndim == 1 else z @ scale.T) + np.asarray(bias, dtype=float)
 
 
+def through(matrix: Array, v: Array) -> Array:
+    """matrix · v, (3, 3) and (3,): an unknown or infinite element of v concerns only what it has a part in."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(matrix == 0.0, 0.0, matrix * v).sum(axis=1))
+
+
 def frd_from_sensor(rotation_body_from_sensor: ArrayLike, body: str) -> Array:
     """Sensor axes → the paper's nose-starboard-underside axes, (3, 3): R_BS, then FLU → FRD where the body is "flu"."""
     r = np.asarray(rotation_body_from_sensor, dtype=float)

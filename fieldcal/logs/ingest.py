@@ -23,7 +23,7 @@ from fieldcal.logs import SIGNAL_COLUMNS, Finding, LogReader, LogSummary, open_l
 from fieldcal.logs.discovery import folder_parts
 from fieldcal.logs.facts import Declared, Facts, FindingFacts, Judged, UnitFacts
 from fieldcal.logs.interface import EPOCH_KNOWN_AFTER_NS
-from fieldcal.logs.on_board import PRIMARY, UNIT_TABLES, units_on_board
+from fieldcal.logs.on_board import PRIMARY, UNIT_TABLES, sensors_of, units_on_board
 from fieldcal.logs.tidy import HELD_ROWS, Disordered, TidySignal
 from fieldcal.logs.warmth import Warmth
 from fieldcal.names import SENSORS, Rotation, Sensor, Triple, Verdict
@@ -308,7 +308,7 @@ def settings_of(facts: Facts, vehicle: Vehicle, unit: str = PRIMARY) -> FlightSe
     known = {} if on_board is None else {Sensor(name): found for name, found in on_board["applied"].items()}
     return replace(
         own,
-        own_sensors=SENSORS if unit == PRIMARY else UNIT_TABLES[signal_kind(unit)],
+        own_sensors=sensors_of(unit),
         applied_matrix={s: _rows_of(known[s]["matrix"]) if s in known else None for s in SENSORS},
         applied_offset={s: _triple(known[s]["offset"]) if s in known else None for s in SENSORS},
         applied_known={s: known[s]["known"] if s in known else None for s in SENSORS},

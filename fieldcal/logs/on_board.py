@@ -12,7 +12,7 @@ from fieldcal.logs.applied import applied
 from fieldcal.logs.facts import UnitFacts
 from fieldcal.logs.interface import SIGNAL_COLUMNS, LogSummary, SensorSource
 from fieldcal.logs.loaded import loaded
-from fieldcal.names import Sensor
+from fieldcal.names import SENSORS, Sensor
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import signal_kind
 
@@ -24,6 +24,11 @@ UNIT_TABLES = {
 }
 """Signal tables that a unit may have of its own, and the sensors whose readings they are."""
 OF_THE_IMU = ("imu", "temperature")
+
+
+def sensors_of(unit: str) -> tuple[Sensor, ...]:
+    """A unit's own sensors: of the primary one all."""
+    return SENSORS if unit == PRIMARY else UNIT_TABLES[signal_kind(unit)]
 
 
 def signals_of(unit: str, tables: Collection[str]) -> dict[str, str]:

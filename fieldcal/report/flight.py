@@ -182,7 +182,7 @@ def _further(calibration: pl.DataFrame) -> list[Part]:
             kept = place.get(row["axis"])
             if kept is None or _rank(row) < _rank(kept):
                 place[row["axis"]] = row
-    columns = [Column("unit", "id"), Column("parameter"), *(Column(axis, "n") for axis in AXES), Column("unit of it")]
+    columns = [Column("on board", "id"), Column("parameter"), *(Column(axis, "n") for axis in AXES), Column("unit")]
     lines = [
         [
             unit_id,

@@ -10,6 +10,7 @@ import polars as pl
 
 from fieldcal.geometry.earth_field import UNIT_IN_TESLA
 from fieldcal.geometry.rotation import Array
+from fieldcal.geometry.sensor_model import through
 from fieldcal.names import RESIDUAL, SENSORS, Json, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables
@@ -105,7 +106,7 @@ def _of_raw(rows: pl.DataFrame, p: Array, o: Array, o_per_degc: Array, p_sd: flo
     if ZERO_SLOPE in {parameter for parameter, _ in found}:
         own = [found[ZERO_SLOPE, axis] for axis in AXES]
         slope, slope_sd = _numbers(own)
-        others += _with(own, _through(inverse, slope - o_per_degc), np.sqrt(_through(inverse**2, slope_sd**2)))
+        others += _with(own, through(inverse, slope - o_per_degc), np.sqrt(through(inverse**2, slope_sd**2)))
     if ("scale", "x") not in found or ("zero", "x") not in found:
         return calibration_rows(others)
     full = ("scale", "xy") in found or np.any(np.abs(p - np.diag(np.diagonal(p))) > SQUARE)
@@ -118,10 +119,10 @@ def _of_raw(rows: pl.DataFrame, p: Array, o: Array, o_per_degc: Array, p_sd: flo
     zero, zero_sd = _numbers([found["zero", axis] for axis in AXES])
     raw_scale = scale @ p
     raw_scale_sd = np.sqrt(scale_sd**2 @ p**2 + p_sd**2 * np.sum(scale**2, axis=1, keepdims=True))
-    raw_zero = _through(inverse, zero - o)
-    raw_zero_sd = np.sqrt(_through(inverse**2, zero_sd**2 + o_sd**2))
-    bias = -_through(raw_scale, raw_zero)
-    bias_sd = np.sqrt(_through(raw_scale_sd**2, raw_zero**2) + _through(raw_scale**2, raw_zero_sd**2))
+    raw_zero = through(inverse, zero - o)
+    raw_zero_sd = np.sqrt(through(inverse**2, zero_sd**2 + o_sd**2))
+    bias = -through(raw_scale, raw_zero)
+    bias_sd = np.sqrt(through(raw_scale_sd**2, raw_zero**2) + through(raw_scale**2, raw_zero_sd**2))
     scales = [found["scale", axis] for axis in AXES]
     out = _with(scales, np.diagonal(raw_scale), np.diagonal(raw_scale_sd))
     out += _with([found["bias", axis] for axis in AXES], bias, bias_sd)
@@ -132,11 +133,6 @@ def _of_raw(rows: pl.DataFrame, p: Array, o: Array, o_per_degc: Array, p_sd: flo
             names = [_copied(scales[i], axis + other) for other in AXES]
             out += _with(names, raw_scale[i], raw_scale_sd[i])
     return calibration_rows(out + others)
-
-
-def _through(matrix: Array, v: Array) -> Array:
-    """matrix · v, where an unknown element of v spoils only what it has a part in."""
-    return np.asarray(np.where(matrix == 0.0, 0.0, matrix * v).sum(axis=1))
 
 
 def _numbers(rows: list[CalibrationRow]) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ import polars as pl
 
 from fieldcal.config.configuration import Alerts
 from fieldcal.names import GRAVEST_FIRST, PREFERRED_METHODS, DriftStatus, Status
+from fieldcal.schemas import table_key
 from fieldcal.schemas.reference import UNCONFIRMED_SD
 from fieldcal.trends.reasons import AGREEMENT
 from fieldcal.warehouse import Warehouse
@@ -21,7 +22,7 @@ STATUSES = GRAVEST_FIRST[:3]
 KINDS: tuple[str, ...] = (*STATUSES, "last_flight", "recovered", "expired", "idle")
 TELLING = ("zero_bias", "zero", "scale", "bias")
 """Which parameter speaks for an axis first: the best conditioned."""
-SERIES = ["unit_id", "sensor", "method", "parameter", "axis"]
+SERIES = list(table_key("drift"))
 
 
 class PlainChange(TypedDict):

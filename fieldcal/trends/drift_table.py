@@ -10,7 +10,7 @@ import polars as pl
 
 from fieldcal.names import GRAVEST_FIRST, RESIDUAL, Status
 from fieldcal.provenance.run_key import run_key, source_digest
-from fieldcal.schemas import TABLES
+from fieldcal.schemas import TABLES, table_key
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import ENOUGH_SESSIONS
 from fieldcal.schemas.rows import DriftRow
@@ -29,7 +29,7 @@ from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.store import empty_frame, read_table
 from fieldcal.words.rows import typed
 
-KEY = ["unit_id", "sensor", "method", "parameter", "axis"]
+KEY = list(table_key("drift"))
 ALIKE = ("sensor", "method", "parameter", "unit")
 SIBLINGS = (*ALIKE, "axis")
 SIGNED = ("scale", "bias", "zero_bias")

@@ -182,9 +182,10 @@ def test_a_browser_that_holds_the_secret_needs_a_token_of_the_page_too(served: P
 def test_an_event_stream_without_the_secret_is_closed(served: Path) -> None:
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.client import connect
+    from websockets.typing import Subprotocol
 
     address = f"{url(served).replace('http', 'ws', 1)}/events/in"
-    with connect(address, subprotocols=["prefect"], proxy=None) as stream:  # type: ignore[list-item]
+    with connect(address, subprotocols=[Subprotocol("prefect")], proxy=None) as stream:
         stream.send(json.dumps({"type": "auth", "token": "fieldcal:wrong"}))
         with pytest.raises(ConnectionClosed):
             stream.recv(timeout=10)

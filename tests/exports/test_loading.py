@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,8 +51,8 @@ def constants(origin: Origin | None, *sensors: Sensor) -> Constants:
     return Constants("v", "i", {s: triad(s) for s in own}, "", {s: f"board/{s}" for s in own}, origins)
 
 
-def px4(c: Constants, **request: object) -> dict[str, float]:
-    text = AUTOPILOTS["px4"](c, Request(**request)).text  # type: ignore[arg-type]
+def px4(c: Constants, **request: Any) -> dict[str, float]:
+    text = AUTOPILOTS["px4"](c, Request(**request)).text
     rows = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
     return {row[2]: float(row[3]) for row in rows}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from logs_support import vehicle
 from preset_files import Readings, made, motive, over, seconds, table, x_imu3
@@ -48,8 +49,8 @@ def told(facts: Facts) -> list[str]:
     return [finding["code"] for finding in facts["findings"]]
 
 
-def triad(frame: object, sensor: str) -> np.ndarray:
-    return np.asarray(frame.select([f"{sensor}_{axis}" for axis in "xyz"]).to_numpy())  # type: ignore[attr-defined]
+def triad(frame: pl.DataFrame, sensor: str) -> np.ndarray:
+    return np.asarray(frame.select([f"{sensor}_{axis}" for axis in "xyz"]).to_numpy())
 
 
 def test_phyphox_files_are_one_log_and_joined(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
 
@@ -260,10 +261,10 @@ NEAR = [
 
 
 @pytest.mark.parametrize(("name", "change"), NEAR, ids=[f"{i}-{name}" for i, (name, _) in enumerate(NEAR)])
-def test_a_near_miss_is_no_such_file(tmp_path: Path, name: str, change: object) -> None:
+def test_a_near_miss_is_no_such_file(tmp_path: Path, name: str, change: Callable[[str], str]) -> None:
     preset, writer = {**IMU_FILES, **VPS_FILES}[name]
     text = writer(READINGS)
-    changed = change(text)  # type: ignore[operator]
+    changed = change(text)
     assert changed != text
     assert recognised(changed) == []
     imu, vps = (changed, None) if name in IMU_FILES else (DEFAULT_IMU, changed)

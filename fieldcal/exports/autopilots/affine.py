@@ -8,8 +8,9 @@ import numpy as np
 from scipy.linalg import polar
 
 from fieldcal.exports.autopilots.thermal import Curve
-from fieldcal.exports.calibration import Triad, through
+from fieldcal.exports.calibration import Triad
 from fieldcal.geometry.rotation import Array
+from fieldcal.geometry.sensor_model import through
 
 
 def of_raw(triad: Triad, matrix: Array, offset: Array, thermal: Curve | None) -> Triad:

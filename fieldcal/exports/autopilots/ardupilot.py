@@ -28,7 +28,7 @@ from fieldcal.exports.autopilots.affine import rotation_and_symmetric
 from fieldcal.exports.autopilots.ardupilot_slot import KIND, ArduPilot, compass_matrix, thermal_block
 from fieldcal.exports.autopilots.loading import Loadable, Request, loadable
 from fieldcal.exports.autopilots.thermal import Curve, curve_to_load, slope_span
-from fieldcal.exports.autopilots.units import dropped_rotation, not_held
+from fieldcal.exports.autopilots.units import SHOWN_UNIT, dropped_rotation, not_held
 from fieldcal.exports.calibration import Constants, Export
 from fieldcal.geometry.rotation import Array
 from fieldcal.logs.dataflash.corrections import COMPASS_SCALE_RANGE, THERMAL_REFERENCE_DEGC, THERMAL_SCALE
@@ -40,7 +40,6 @@ SCALE_LIMITS, OFFSET_LIMIT_MPS2 = (0.8, 1.2), 3.5
 COMPASS_OFFSET_LIMIT_MG, DIAGONAL_LIMITS, OFF_DIAGONAL_LIMIT = 1500.0, (0.8, 1.2), 0.2
 NOT_ZERO = {Sensor.ACCELEROMETER: 1e-5, Sensor.MAGNETOMETER: 1e-2}
 """An offset that is not zero to the firmware (FLT_EPSILON), and nothing to the sensor: m/s², milligauss."""
-UNIT = {Sensor.GYROSCOPE: "rad/s", Sensor.ACCELEROMETER: "m/s²", Sensor.MAGNETOMETER: "mG"}
 Row = tuple[str, float]
 
 
@@ -134,7 +133,7 @@ def _thermal(slot: int, sensors: dict[Sensor, Loadable]) -> tuple[list[Row], lis
         return [], []
     low, high = min(c.low_degc for c in curves.values()), max(c.high_degc for c in curves.values())
     if high - low < LEAST_SPAN_DEGC:
-        moved = ", ".join(f"{sensor} {slope_span(sensors[sensor].triad):.2g} {UNIT[sensor]}" for sensor in curves)
+        moved = ", ".join(f"{sensor} {slope_span(sensors[sensor].triad):.2g} {SHOWN_UNIT[sensor]}" for sensor in curves)
         return [], [
             f"Flown between {low:.1f} and {high:.1f} °C: ArduPilot wants 10 °C for a temperature calibration, so it is"
             f" left out ({moved})."

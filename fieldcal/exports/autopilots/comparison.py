@@ -12,23 +12,24 @@ from typing import Literal
 
 import numpy as np
 
+from fieldcal.config.flight_settings import STANDARD_GRAVITY_MPS2
 from fieldcal.errors import FieldcalError
 from fieldcal.exports.autopilots.affine import rotation_and_symmetric
 from fieldcal.exports.autopilots.ardupilot_slot import ArduPilot
 from fieldcal.exports.autopilots.loading import Loadable, Request, Slots, loadable
 from fieldcal.exports.autopilots.px4_slot import Px4
+from fieldcal.exports.autopilots.units import SHOWN_UNIT
 from fieldcal.exports.calibration import Constants, Triad
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Sensor
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.stages.tables import AXES
 from fieldcal.words.numbers import number, with_sd
 
 TARGETS: Mapping[str, Slots] = {"px4": Px4(), "ardupilot": ArduPilot()}
 FIRST_LETTERS = {"px4": ("CAL_", "TC_"), "ardupilot": ("INS_", "COMPASS_")}
 """Of the parameters by which a file tells whose it is."""
-AXES = "xyz"
 DEAD_RECKONING_S = 60.0
-G_MPS2 = 9.80665
 FULL_TURN_DEG = 360.0
 MATTERS = {"° in 60 s": 5.0, "° a turn": 3.0, "mg": 5.0, "° of heading": 1.0}
 """Effects from which on a difference is worth a change: of attitude by rates alone, in a full turn, of tilt and speed,
@@ -145,12 +146,11 @@ def _of_sensor(one: Loadable, target: Slots) -> list[Compared]:
     if one.sensor == Sensor.MAGNETOMETER:
         scale = rotation_and_symmetric(scale)[1]
     rows: list[Compared] = []
-    unit = {Sensor.GYROSCOPE: "rad/s", Sensor.ACCELEROMETER: "m/s²", Sensor.MAGNETOMETER: "G"}[one.sensor]
     size = target.magnetic_unit if one.sensor == Sensor.MAGNETOMETER else 1.0
     for i, axis in enumerate(AXES):
         zero = size * one.triad.zero[i], size * flown.zero[i], size * one.triad.zero_sd[i]
         factor = scale[i, i], there[i, i], one.triad.scale_sd[i]
-        for what, (estimate, loaded, sd), shown in (("zero", zero, unit), ("scale", factor, "")):
+        for what, (estimate, loaded, sd), shown in (("zero", zero, SHOWN_UNIT[one.sensor]), ("scale", factor, "")):
             effect, effect_unit = _effect(one.sensor, what, abs(estimate - loaded), one.horizontal_field_g)
             sure = not np.isfinite(sd) or abs(estimate - loaded) > SURE_SD * sd
             rows.append(
@@ -179,7 +179,7 @@ def _effect(sensor: Sensor, what: str, difference: float, field_g: float | None)
             return float(np.rad2deg(difference) * DEAD_RECKONING_S), "° in 60 s"
         return difference * FULL_TURN_DEG, "° a turn"
     if sensor == Sensor.ACCELEROMETER:
-        return 1e3 * (difference / G_MPS2 if what == "zero" else difference), "mg"
+        return 1e3 * (difference / STANDARD_GRAVITY_MPS2 if what == "zero" else difference), "mg"
     # A zero of one axis turns the field by at most so much; two axes' scales that differ by s turn it by s / 2.
     if what == "scale":
         return float(np.rad2deg(0.5 * difference)), "° of heading"

@@ -22,17 +22,15 @@ from fieldcal.exports.autopilots.affine import rotation_and_symmetric
 from fieldcal.exports.autopilots.loading import Loadable, Request, loadable
 from fieldcal.exports.autopilots.px4_slot import Px4, signed, thermal_block, thermal_slot
 from fieldcal.exports.autopilots.thermal import curve_to_load, slope_span
-from fieldcal.exports.autopilots.units import dropped_rotation, not_held
+from fieldcal.exports.autopilots.units import SHOWN_UNIT, dropped_rotation, not_held
 from fieldcal.exports.calibration import Constants, Export
 from fieldcal.geometry.rotation import Array
-from fieldcal.logs.ulog.parameters import BY_ITSELF, CALIBRATION, THERMAL
+from fieldcal.logs.ulog.parameters import AXES, BY_ITSELF, CALIBRATION, THERMAL
 from fieldcal.names import Sensor
 
 REAL32, INT32 = 9, 6
 AUTOPILOT_COMPONENT = 1
-AXES = "XYZ"
 SCALE_LIMITS = (0.1, 3.0)
-UNIT = {Sensor.GYROSCOPE: "rad/s", Sensor.ACCELEROMETER: "m/s²", Sensor.MAGNETOMETER: "G"}
 Row = tuple[str, float, int]
 
 
@@ -104,8 +102,8 @@ def _offset(one: Loadable) -> tuple[Array, list[Row], list[str]]:
     name = THERMAL[sensor]
     if one.device_id is None or slot is None:
         left_out = (
-            f"{sensor}: slopes over temperature, up to {slope_span(triad):.2g} {UNIT[sensor]} over what was flown, are"
-            f" left out: no {name}n_ID is known for its device id. Offsets are those at {at:g} °C."
+            f"{sensor}: slopes over temperature, up to {slope_span(triad):.2g} {SHOWN_UNIT[sensor]} over what was"
+            f" flown, are left out: no {name}n_ID is known for its device id. Offsets are those at {at:g} °C."
         )
         return kept, [], [left_out]
     own = f"{name}{slot}_"

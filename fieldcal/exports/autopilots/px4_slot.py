@@ -12,7 +12,7 @@ from fieldcal.exports.autopilots.affine import of_raw
 from fieldcal.exports.autopilots.thermal import Curve
 from fieldcal.exports.calibration import Triad
 from fieldcal.geometry.rotation import Array
-from fieldcal.logs.ulog.parameters import AUTOPILOT, CALIBRATION, SLOTS, THERMAL, correction, slot_of
+from fieldcal.logs.ulog.parameters import AUTOPILOT, AXES, CALIBRATION, SLOTS, THERMAL, correction, slot_of
 from fieldcal.names import Sensor
 
 SIGNED_ABOVE = 1 << 31
@@ -53,7 +53,7 @@ class Px4:
         """The parameter that holds a sensor's constant; None where there is none."""
         if (sensor, what) == (Sensor.GYROSCOPE, "scale"):
             return None
-        return f"{CALIBRATION[sensor]}{slot}_{'XYZ'[axis]}{'OFF' if what == 'zero' else 'SCALE'}"
+        return f"{CALIBRATION[sensor]}{slot}_{AXES[axis]}{'OFF' if what == 'zero' else 'SCALE'}"
 
     def raw(self, triad: Triad, sensor: Sensor, slot: int, parameters: Mapping[str, float]) -> Triad:
         """Constants of the raw sensor in its own axes, from those of readings in body axes that PX4 had corrected."""

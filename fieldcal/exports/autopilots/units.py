@@ -11,17 +11,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from fieldcal.config.flight_settings import ACCELEROMETER_IN_MPS2, GYROSCOPE_IN_RADPS
 from fieldcal.exports.autopilots.affine import angle_deg
 from fieldcal.exports.calibration import Triad
+from fieldcal.geometry.earth_field import UNIT_IN_TESLA
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Sensor
 
 UNIT = {
-    "gyroscope": {"rad/s": 1.0, "deg/s": float(np.pi / 180.0)},
-    "accelerometer": {"m/s^2": 1.0, "g": 9.80665},
-    "magnetometer": {"T": 1e4, "uT": 1e-2, "G": 1.0},
+    "gyroscope": GYROSCOPE_IN_RADPS,
+    "accelerometer": ACCELEROMETER_IN_MPS2,
+    "magnetometer": {unit: tesla / UNIT_IN_TESLA["G"] for unit, tesla in UNIT_IN_TESLA.items()},
 }
-"""Units of a log as rad/s, m/s² and gauss."""
+"""Units of a log in rad/s, m/s² and gauss."""
+SHOWN_UNIT = {Sensor.GYROSCOPE: "rad/s", Sensor.ACCELEROMETER: "m/s²", Sensor.MAGNETOMETER: "G"}
+"""The same, for people."""
 ROUNDING = 1e-9
 """A cross-axis term that is none."""
 LEAST_ANGLE_DEG = 1e-6

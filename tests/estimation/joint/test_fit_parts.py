@@ -23,6 +23,7 @@ from fieldcal.estimation.joint.problem import TRIADS, Model, PriorConstants, Sta
 from fieldcal.estimation.joint.score_corrections import logged_units, within_intervals
 from fieldcal.estimation.joint.variance_components import robust_weight
 from fieldcal.geometry.rotation import Array, from_rotation_vector, multiply
+from fieldcal.reason_codes import ReasonCode
 
 TERMS = tuple(f"{name}_cross" for name in TRIADS)
 STEP = 1e-6
@@ -221,7 +222,7 @@ class Script:
     def iterate(self, model: Any, state: Any, levels: Any, spent: int, how: Options) -> tuple[JointFit, Array]:
         self.asked.append((model, levels, spent, how))
         if len(self.asked) <= self.fails:
-            raise EstimationError("joint_diverged", "no")  # type: ignore[arg-type]
+            raise EstimationError(ReasonCode.JOINT_DIVERGED, "no")
         return made(self.flight, iterations=spent + 5, options=how), np.zeros(0)
 
     def passing_fields(self, model: Any, weight: Array) -> np.ndarray:

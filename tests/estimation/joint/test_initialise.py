@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -191,13 +192,13 @@ def test_a_field_far_off_its_mean_has_half_the_weight_at_a_tenth_of_itself() -> 
     assert initialise._means(r, {"accelerometer": carried["accelerometer"]}, 0.2, 1.5).keys() == {"accelerometer"}
 
 
-def blank(t: Array, segment: np.ndarray, **changes: object) -> Readings:
+def blank(t: Array, segment: np.ndarray, **changes: Any) -> Readings:
     n = len(t)
-    given: dict[str, object] = {
+    given: dict[str, Any] = {
         "t": t, "segment": segment, "gyroscope": np.zeros((n, 3)), "accelerometer": None, "magnetometer": None,
         "gravity_mps2": G, "field_ned": FIELD_NED, "turning": np.zeros((2, n, 3)),
     }  # fmt: skip
-    return Readings(**{**given, **changes})  # type: ignore[arg-type]
+    return Readings(**{**given, **changes})
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -23,6 +23,7 @@ from fieldcal.estimation.joint.measurement_model import layout_of
 from fieldcal.estimation.joint.model_selection import TermTest, add_terms, candidates, summary, with_terms, with_zeros
 from fieldcal.estimation.joint.problem import TERMS
 from fieldcal.geometry.rotation import Array, from_rotation_vector, multiply
+from fieldcal.reason_codes import ReasonCode
 
 NEAR = 1e-3
 SETTLED = 1e-5  # of residuals over their sd, where iterations end
@@ -183,7 +184,7 @@ class Scripted:
     def with_terms(self, fit: JointFit, names: list[str]) -> JointFit:
         self.made.append(names)
         if self.fails:
-            raise EstimationError("joint_diverged", "no")  # type: ignore[arg-type]
+            raise EstimationError(ReasonCode.JOINT_DIVERGED, "no")
         return replace(fit, iterations=99)
 
     def doubt(self, fit: JointFit, moved: list[dict[str, Array]]) -> JointFit:
@@ -357,7 +358,7 @@ class Split:
     def refitted(self, model: Any, state: Any, levels: Any, like: Any, names: list[str], vps: Any) -> Any:
         assert model == "from 0"
         if self.fails in names and self.fails:
-            raise EstimationError("joint_diverged", "no")  # type: ignore[arg-type]
+            raise EstimationError(ReasonCode.JOINT_DIVERGED, "no")
         all_names = (*state.names, *names)
         return SimpleNamespace(state=SimpleNamespace(names=all_names), levels=None, names=all_names)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,15 +24,15 @@ from fieldcal.estimation.joint.problem import (
 from fieldcal.geometry.rotation import from_rotation_vector, multiply
 
 
-def readings(n: int = 100, interval_s: float = 1.0 / 256.0, **changes: object) -> Readings:
+def readings(n: int = 100, interval_s: float = 1.0 / 256.0, **changes: Any) -> Readings:
     rng = np.random.default_rng(1)
-    given: dict[str, object] = {
+    given: dict[str, Any] = {
         "t": np.arange(n) * interval_s, "segment": np.zeros(n, dtype=np.int64), "gyroscope": rng.normal(size=(n, 3)),
         "accelerometer": rng.normal(size=(n, 3)), "magnetometer": rng.normal(size=(n, 3)), "gravity_mps2": 9.81,
         "field_ned": FIELD_NED, "turning": rng.normal(size=(2, n, 3)), "warmth": rng.normal(size=n),
         "force": rng.normal(size=(n, 3)),
     }  # fmt: skip
-    return Readings(**{**given, **changes})  # type: ignore[arg-type]
+    return Readings(**{**given, **changes})
 
 
 def test_a_part_is_every_array_s() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,8 +28,8 @@ from fieldcal.geometry.rotation import Array, from_rotation_vector, multiply
 SHARP = 0.1  # relative, of a robust sd by some hundred residuals
 
 
-def model(*, missing: bool = False, **how: object) -> Model:
-    return small(missing=missing, **how).model  # type: ignore[arg-type]
+def model(*, missing: bool = False, **how: Any) -> Model:
+    return small(missing=missing, **how).model
 
 
 def noise(of: Model, sd: Array, seed: int = 1) -> Array:
@@ -36,11 +37,11 @@ def noise(of: Model, sd: Array, seed: int = 1) -> Array:
     return np.asarray(sd * np.random.default_rng(seed).normal(size=(len(of.at), len(sd))) * valid)
 
 
-def levels(r: int = 6, **changes: object) -> Levels:
-    given: dict[str, object] = {
+def levels(r: int = 6, **changes: Any) -> Levels:
+    given: dict[str, Any] = {
         "variance": np.full(r, 0.01), "colour": np.ones(r), "colour_within": np.ones(r), "walk": 1e-4, "strength": 0.5
     }  # fmt: skip
-    return Levels(**{**given, **changes})  # type: ignore[arg-type]
+    return Levels(**{**given, **changes})
 
 
 SD = np.array([0.1, 0.2, 0.05, 0.02, 0.3, 0.1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,13 +40,13 @@ def poses(interval_s: float = INTERVAL_S) -> tuple[Array, Array]:
     return stamps, multiply(multiply(inverse[0], q), inverse[1])
 
 
-def record(flight: Small, interval_s: float = INTERVAL_S, **changes: object) -> VpsRecord:
+def record(flight: Small, interval_s: float = INTERVAL_S, **changes: Any) -> VpsRecord:
     t, q = poses(interval_s)
-    given = {"t": t, "q": q, "clock": clock(), **changes}
+    given: dict[str, Any] = {"t": t, "q": q, "clock": clock(), **changes}
     found = VpsRecord.of(
         given["t"], given["q"], given["clock"], flight.model, flight.state, trajectory(flight.model, flight.state),
         max_gap_s=0.02,
-    )  # type: ignore[arg-type]  # fmt: skip
+    )  # fmt: skip
     assert found is not None
     return found
 
@@ -55,9 +56,9 @@ def aligned(flight: Small) -> VpsRecord:
     return replace(record(flight), world=WORLD, body=BODY)
 
 
-def flight(**how: object) -> Small:
+def flight(**how: Any) -> Small:
     """With knots every 25 ms: more than the fewest that poses are used at."""
-    own = small(spacing_s=0.025, missing=False, **how)  # type: ignore[arg-type]
+    own = small(spacing_s=0.025, missing=False, **how)
     assert len(own.model.knots.index) > MIN_POSES
     return own
 
