@@ -52,14 +52,17 @@ __all__ = [
     "Compared",
     "ConfigurationError",
     "Constants",
+    "Decided",
     "EllipsoidFit",
     "Estimate",
     "EstimationError",
     "Experiment",
     "Export",
     "FieldcalError",
+    "HandedOut",
     "JointEstimate",
     "OutputErrorFit",
+    "Part",
     "Recording",
     "Refused",
     "SensorCalibration",
@@ -71,6 +74,7 @@ __all__ = [
     "VpsClock",
     "Warehouse",
     "WarehouseError",
+    "Written",
     "apply",
     "calibrate",
     "compare",
@@ -119,7 +123,7 @@ _NAMES_OF = {
     ),
     "api.sensor": ("SensorCalibration",),
     "api.vps_clock": ("VpsClock",),
-    "api.warehouse": ("Warehouse",),
+    "api.warehouse": ("Decided", "Part", "Warehouse"),
     "errors": (
         "ConfigurationError",
         "EstimationError",
@@ -134,7 +138,9 @@ _NAMES_OF = {
         "Constants",
         "Export",
         "Triad",
+        "Written",
     ),
+    "exports.handed_out": ("HandedOut",),
     "simulation.archive": ("write_flights",),
     "simulation.experiment": (
         "Experiment",
@@ -157,7 +163,7 @@ if TYPE_CHECKING:
     from fieldcal.api.recording import Recording, read_log
     from fieldcal.api.sensor import SensorCalibration
     from fieldcal.api.vps_clock import VpsClock
-    from fieldcal.api.warehouse import Warehouse
+    from fieldcal.api.warehouse import Decided, Part, Warehouse
     from fieldcal.errors import (
         ConfigurationError,
         EstimationError,
@@ -168,7 +174,8 @@ if TYPE_CHECKING:
     )
     from fieldcal.exports.apply import CalibratedReadings
     from fieldcal.exports.autopilots.comparison import Compared
-    from fieldcal.exports.calibration import Constants, Export, Triad
+    from fieldcal.exports.calibration import Constants, Export, Triad, Written
+    from fieldcal.exports.handed_out import HandedOut
     from fieldcal.simulation.archive import write_flights
     from fieldcal.simulation.experiment import Experiment, SimulatedFlight, simulate
     from fieldcal.warehouse.errors import WarehouseError

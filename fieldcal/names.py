@@ -114,6 +114,17 @@ class Status(StrEnum):
     """There is nothing to do."""
     FAILED = "failed"
     """An error of fieldcal's own."""
+    WITHDRAWN = "withdrawn"
+    """It was ok, and somebody decided that it does not count."""
+
+
+class Decision(StrEnum):
+    """What people decide about flights and rows."""
+
+    WITHDRAW = "withdraw"
+    """It counts nowhere, and stays."""
+    ACCEPT = "accept"
+    """It counts, again or as it did."""
 
 
 class Verdict(StrEnum):

@@ -273,7 +273,8 @@ STATUS = Column(
     "status",
     _TEXT,
     "",
-    "outcome: ok, refused, absent or failed (`drift`: stable, drifting, step, outlier, insufficient)",
+    "outcome: ok, refused, absent, failed, or withdrawn by a decision (`drift`: stable, drifting, step, outlier, "
+    "insufficient)",
 )
 
 # --- run
@@ -351,3 +352,27 @@ FLEET_Z = Column(
     "1",
     "distance from the fleet's other units, in sd; of a VPS lag: of its scatter's logarithm; null with few siblings",
 )
+
+# --- decision
+DECIDED_AT = Column("decided_at", pa.timestamp("us", tz="UTC"), "", "when it was decided, UTC", provenance=True)
+DECISION = Column(
+    "decision", _TEXT, "", "withdraw: what it names counts nowhere from then on; accept: it counts, again or as it did"
+)
+AUTHOR = Column("author", _TEXT, "", "who decided or exported", provenance=True)
+
+# --- export
+EXPORTED_AT = Column("exported_at", pa.timestamp("us", tz="UTC"), "", "when it was exported, UTC", provenance=True)
+LATEST_FLIGHT_ID = Column(
+    "latest_flight_id",
+    _TEXT,
+    "",
+    "the vehicle's latest flight that the history had then; null: it had none",
+    provenance=True,
+)
+EXPORT_FORMAT = Column("format", _TEXT, "", "whose format it is: px4, ardupilot, ros, kalibr, json, ...")
+EXPORT_SHA256 = Column("text_sha256", _TEXT, "", "sha256 of the exported text")
+AT_TEMPERATURE_DEGC = Column("at_degc", _F64, "degC", "temperature that the constants were asked for")
+TARGET_NAME = Column(
+    "name", _TEXT, "", "the autopilot's parameter; of other formats the constant and its axes, as zero_x or scale_xy"
+)
+SET_TO = Column("set_to", _F64, "as its target has it", "what it was exported as")

@@ -14,3 +14,6 @@ ENOUGH_SESSIONS = 5
 
 PLAUSIBLE_DEGC = (-60.0, 150.0)
 """What an inertial sensor's own temperature can be, °C."""
+
+SAME_VALUE = 1e-5
+"""Share by which a number that went through an autopilot's float32 and a ground station's text may differ."""

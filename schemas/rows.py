@@ -179,6 +179,37 @@ class DriftRow(TypedDict):
     curve_per_degc3_sd: float | None
 
 
+class DecisionRow(TypedDict):
+    """A row of `decision`. What names a part of the flight is None for all of it."""
+
+    vehicle_id: str
+    flight_id: str
+    decided_at: datetime
+    decision: str
+    unit_id: str | None
+    sensor: str | None
+    parameter: str | None
+    axis: str | None
+    author: str
+    reason: str | None
+
+
+class ExportRow(TypedDict):
+    """A row of `export`."""
+
+    vehicle_id: str
+    exported_at: datetime
+    latest_flight_id: str | None
+    format: str
+    unit_id: str
+    sensor: str
+    name: str
+    set_to: float
+    at_degc: float
+    author: str
+    text_sha256: str
+
+
 class FlightDocument(TypedDict):
     """What is known of one flight, by table."""
 
@@ -196,6 +227,8 @@ ROWS = {
     "sync": SyncRow,
     "run": RunRow,
     "drift": DriftRow,
+    "decision": DecisionRow,
+    "export": ExportRow,
 }
 
 

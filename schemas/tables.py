@@ -272,12 +272,53 @@ _HISTORY = (
         ),
         ("unit_id", "sensor", "method", "parameter", "axis"),
     ),
+    Table(
+        "decision",
+        "history",
+        1,
+        "one row a flight that somebody decided about: whether it counts, or its part that is named; null: every one",
+        (
+            c.VEHICLE_ID,
+            c.FLIGHT_ID,
+            c.DECIDED_AT,
+            c.DECISION,
+            c.UNIT_ID,
+            c.SENSOR,
+            c.PARAMETER,
+            c.AXIS,
+            c.AUTHOR,
+            c.REASON,
+        ),
+        ("flight_id", "decided_at"),
+    ),
+    Table(
+        "export",
+        "history",
+        1,
+        "one row a number that was handed out for a unit's sensor to fly with",
+        (
+            c.VEHICLE_ID,
+            c.EXPORTED_AT,
+            c.LATEST_FLIGHT_ID,
+            c.EXPORT_FORMAT,
+            c.UNIT_ID,
+            c.SENSOR,
+            c.TARGET_NAME,
+            c.SET_TO,
+            c.AT_TEMPERATURE_DEGC,
+            c.AUTHOR,
+            c.EXPORT_SHA256,
+        ),
+        ("exported_at", "unit_id", "sensor", "name"),
+    ),
 )
 
 TABLES: dict[str, Table] = {table.name: table for table in (*_SIGNALS, *_STAGES, *_HISTORY)}
 SIGNAL_TABLES = tuple(table.name for table in _SIGNALS)
 STAGE_TABLES = tuple(table.name for table in _STAGES)
 HISTORY_TABLES = tuple(table.name for table in _HISTORY)
+FLIGHT_TABLES = ("flight", "calibration", "fit", "sync", "run")
+"""Those of the history that nights fill, flight by flight."""
 
 UNITS_APART = "."
 """Between a signal's name and the number of a further unit on board: "imu.1"."""

@@ -1,4 +1,8 @@
-"""Publish into the history: one file a vehicle and table, replaced whole, atomically, and only when it changes."""
+"""Publish into the history: one file a vehicle and table, replaced whole, atomically, and only when it changes.
+
+Nights replace flights and trends; decisions and exports are only ever added. What was decided holds for rows that are
+published later too.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ import polars as pl
 
 from fieldcal import schemas
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.schemas import HISTORY_TABLES, SchemaMismatch
+from fieldcal.schemas import FLIGHT_TABLES, HISTORY_TABLES, SchemaMismatch
 from fieldcal.schemas.columns import SEQUENCE, STARTED_AT
 from fieldcal.warehouse import checksums
 from fieldcal.warehouse.errors import WarehouseError, disk
@@ -19,8 +23,9 @@ from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import checksum_path, history_path
 from fieldcal.warehouse.lock import vehicle_lock
 from fieldcal.warehouse.store import conform, empty_frame, frame, read_arrow, read_table, table_bytes
+from fieldcal.warehouse.withdrawn import DECIDED, as_decided, decisions
 
-_ORDER = (*(name for name in HISTORY_TABLES if name != "flight"), "flight")
+_ORDER = (*(name for name in FLIGHT_TABLES if name != "flight"), "drift", "flight")
 
 
 def publish(
@@ -57,7 +62,9 @@ def publish(
     SchemaMismatch
         Rows are not of their table, of another vehicle or flight, or two have the same key.
     """
-    prepared = {table: _prepared(table, new, vehicle_id, frozenset(flights)) for table, new in rows.items()}
+    prepared = {table: _prepared(table, new, vehicle_id) for table, new in rows.items()}
+    for table in prepared.keys() & FLIGHT_TABLES:
+        _only(table, "flight", prepared[table]["flight_id"], set(flights))
     changed = []
     with vehicle_lock(root, vehicle_id, timeout_s):
         for table in _ORDER:
@@ -69,6 +76,19 @@ def publish(
     return tuple(changed)
 
 
+def append(root: Path, vehicle_id: str, table: str, rows: pl.DataFrame, *, timeout_s: float = 300.0) -> None:
+    """Add rows to a vehicle's `decision` or `export`; raises as `publish`."""
+    new = _prepared(table, rows, vehicle_id)
+    with vehicle_lock(root, vehicle_id, timeout_s):
+        _replace(root, table, vehicle_id, new, ())
+
+
+def settle(root: Path, vehicle_id: str, *, timeout_s: float = 300.0) -> tuple[str, ...]:
+    """Bring the statuses of a vehicle's rows up to what is decided; the tables that changed. Raises as `publish`."""
+    with vehicle_lock(root, vehicle_id, timeout_s):
+        return tuple(table for table in DECIDED if _replace(root, table, vehicle_id, empty_frame(table), ()))
+
+
 def read_history(root: Path, table: str, vehicle_id: str) -> pl.DataFrame:
     """A vehicle's history as it is; no rows when there is none."""
     path = history_path(root, table, vehicle_id)
@@ -76,13 +96,11 @@ def read_history(root: Path, table: str, vehicle_id: str) -> pl.DataFrame:
     return read_table(path, table) if path.exists() else empty_frame(table)
 
 
-def _prepared(table: str, rows: pl.DataFrame, vehicle_id: str, flights: frozenset[str]) -> pl.DataFrame:
+def _prepared(table: str, rows: pl.DataFrame, vehicle_id: str) -> pl.DataFrame:
     if table not in HISTORY_TABLES:
         raise SchemaMismatch(f"{table} is no table of the history; those are {', '.join(HISTORY_TABLES)}")
     result = frame(conform(rows, table))
     _only(table, "vehicle", result["vehicle_id"], {vehicle_id})
-    if table != "drift":
-        _only(table, "flight", result["flight_id"], flights)
     return result.with_columns(pl.col(pl.Float64).fill_nan(None))
 
 
@@ -94,10 +112,15 @@ def _only(table: str, what: str, found: pl.Series, allowed: Collection[str]) -> 
 def _replace(root: Path, table: str, vehicle_id: str, new: pl.DataFrame, flights: Collection[str]) -> bool:
     path = history_path(root, table, vehicle_id)
     before, there = _existing(root, path, table)
-    kept = there.clear() if table == "drift" else there.filter(~pl.col("flight_id").is_in(list(flights)))
+    kept = there.clear() if table == "drift" else there
+    if table in FLIGHT_TABLES and flights:
+        kept = there.filter(~pl.col("flight_id").is_in(list(flights)))
     if before is None and not new.height:
         return False
-    after = table_bytes(_sorted(table, pl.concat([kept, new])), table)
+    rows = pl.concat([kept, new])
+    if table in DECIDED:
+        rows = as_decided(table, rows, decisions(root))
+    after = table_bytes(_sorted(table, rows), table)
     if after == before:
         return False
     write_bytes(path, after, partial(checksums.recording, root, path))
@@ -125,5 +148,5 @@ def _sorted(table: str, rows: pl.DataFrame) -> pl.DataFrame:
     if (double := rows.select(key).is_duplicated()).any():
         first = rows.filter(double).select(key).row(0)
         raise SchemaMismatch(f"{table}: more than one row with {', '.join(key)} = {', '.join(map(str, first))}")
-    order = key if table == "drift" else [STARTED_AT.name, SEQUENCE.name, *key]
+    order = [STARTED_AT.name, SEQUENCE.name, *key] if table in FLIGHT_TABLES else key
     return rows.sort(order, nulls_last=False)

@@ -11,6 +11,7 @@ from fieldcal.errors import FieldcalError
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.warehouse import Warehouse, WarehouseError
+from fieldcal.warehouse.withdrawn import decisions, withdrawn_flights
 
 COLUMNS = (
     "started_at",
@@ -49,10 +50,10 @@ def calibration_history(
 
 def units_flown(warehouse: Warehouse, vehicle_id: str | None = None) -> pl.DataFrame:
     """vehicle_id, imu_id, unit_id, sensor: what each vehicle flew with last, calibrated or refused: the primary unit of
-    each sensor, on the IMU of its latest flight."""
+    each sensor, on the IMU of its latest flight that was not withdrawn."""
     last = (
         warehouse.scan("calibration", vehicle_id=vehicle_id)
-        .filter("is_primary")
+        .filter("is_primary", ~pl.col("flight_id").is_in(withdrawn_flights(decisions(warehouse.root))))
         .sort(FLOWN_ORDER, nulls_last=False)
         .with_columns(now=pl.col("imu_id").last().over("vehicle_id"))
         .filter(pl.col("imu_id") == pl.col("now"))

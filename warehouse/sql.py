@@ -33,7 +33,7 @@ from fieldcal.warehouse.store import by_absent_columns, frame
 from fieldcal.warehouse.views import view_text
 
 # In the order in which they are made: later ones may need earlier ones.
-VIEWS = ("latest_calibration", "history", "drift_by_temperature", "worst_tic", "refusals", "calibration_at")
+VIEWS = ("latest_calibration", "history", "drift_by_temperature", "worst_tic", "refusals", "active", "calibration_at")
 
 _ABOUT_ALL = ("show", "describe", "summarize", "information_schema", "duckdb_", "pg_", "pragma_")
 _ENGINE = Path(__file__).with_name("sql_engine.py")

@@ -1,23 +1,64 @@
-"""`fieldcal.Warehouse`: what the nights have found, asked in polars or SQL."""
+"""`fieldcal.Warehouse`: what the nights have found, asked in polars or SQL, and what people decide about it."""
 
 from __future__ import annotations
 
+import getpass
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, TypedDict, Unpack
 
 import polars as pl
 
+from fieldcal.names import Decision
+from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.warehouse import query
 from fieldcal.warehouse.questions import calibration_history, existing
 
 if TYPE_CHECKING:
-    from fieldcal.exports.calibration import Constants
+    from fieldcal.exports.calibration import Constants, Export
+    from fieldcal.exports.handed_out import HandedOut
     from fieldcal.warehouse.sql import Limits, SqlValue
 
 
+class Part(TypedDict, total=False):
+    """What of a target a decision is about; None: everything."""
+
+    session: str | None
+    unit: str | None
+    sensor: str | None
+    parameter: str | None
+    axis: str | None
+
+
+@dataclass(frozen=True)
+class Decided:
+    """What a decision was about.
+
+    Attributes
+    ----------
+    decision : {"withdraw", "accept"}
+    flight_ids : tuple of str
+        Flights that it names.
+    constants : int
+        Constants that do not count any more, or count again.
+    trends : tuple of str
+        Vehicles whose trends became others by it.
+
+    Examples
+    --------
+    >>> Decided(Decision.WITHDRAW, ("5f0c",), 36, ("quad-1",)).constants
+    36
+    """
+
+    decision: Decision
+    flight_ids: tuple[str, ...]
+    constants: int
+    trends: tuple[str, ...]
+
+
 class Warehouse(query.Warehouse):
-    """The results of all nights below a root. It only reads.
+    """The results of all nights below a root. It only reads, but for what people decide and export.
 
     Parameters
     ----------
@@ -46,8 +87,8 @@ class Warehouse(query.Warehouse):
         Parameters
         ----------
         query : str
-            One SELECT in DuckDB's dialect. Tables: flight, calibration, fit, sync, run, drift; views:
-            latest_calibration, history, drift_by_temperature, worst_tic, refusals, calibration_at(°C).
+            One SELECT in DuckDB's dialect. Tables: flight, calibration, fit, sync, run, drift, decision, export; views:
+            latest_calibration, history, drift_by_temperature, worst_tic, refusals, active, calibration_at(°C).
         parameters : sequence, optional
             Fill its ``?`` marks.
         **limits
@@ -115,3 +156,81 @@ class Warehouse(query.Warehouse):
         from fieldcal.exports.calibration_at import constants_of
 
         return constants_of(self.root, vehicle, temperature_degc, unit)
+
+    def withdraw(self, target: str, *, reason: str, author: str | None = None, **part: Unpack[Part]) -> Decided:
+        """Decide that a flight, or a part of it, counts nowhere: not in trends, constants to fly with or exports. Its
+        rows stay, with status `withdrawn`, also when a night publishes it anew.
+
+        Parameters
+        ----------
+        target : str
+            A flight's id, its beginning, or its log; or a vehicle, whose flights in the history today are meant.
+        reason : str
+            Why, for who reads it later.
+        author : str, optional
+            Who decides; else the user of this process.
+        **part
+            `session`: only flights of this one; `unit`, `sensor`, `parameter`, `axis`: only constants of these.
+
+        Raises
+        ------
+        FieldcalError
+            `no_warehouse`, `not_found`; `wrong_option`: there is no reason.
+        """
+        return self._decide(Decision.WITHDRAW, target, reason, author, part)
+
+    def accept(self, target: str, *, reason: str, author: str | None = None, **part: Unpack[Part]) -> Decided:
+        """Decide that a flight, or a part of it, counts: again, where it was withdrawn. What was refused stays refused.
+
+        Parameters as in `withdraw`.
+        """
+        return self._decide(Decision.ACCEPT, target, reason, author, part)
+
+    def record_export(
+        self,
+        constants: Constants,
+        to: str,
+        export: Export,
+        *,
+        author: str | None = None,
+        temperature_degc: float | None = None,
+    ) -> bool:
+        """Remember that constants were exported in a format, so that the next logs tell whether they were loaded; False
+        where the same text was the last one.
+
+        Raises
+        ------
+        WarehouseError
+            `busy`, or the disk's refusal.
+        """
+        from fieldcal.exports.handed_out import record_export
+
+        at_degc = REFERENCE_DEGC if temperature_degc is None else temperature_degc
+        return record_export(self.root, constants, to, export, author=author or this_user(), at_degc=at_degc)
+
+    def exports(self, vehicle: str) -> list[HandedOut]:
+        """The latest export of each sensor of a vehicle to an autopilot, and what became of it by the logs since."""
+        from fieldcal.exports.handed_out import handed_out
+
+        return handed_out(self.root, vehicle)
+
+    def _decide(self, decision: Decision, target: str, reason: str, author: str | None, part: Part) -> Decided:
+        from fieldcal.trends.drift_table import update_drift
+        from fieldcal.warehouse.decisions import decide, flights_meant
+        from fieldcal.warehouse.lock import fleet_lock
+
+        columns = {"unit_id": part.get("unit"), **{name: part.get(name) for name in ("sensor", "parameter", "axis")}}
+        named = {name: str(value) for name, value in columns.items() if value is not None}
+        flights = flights_meant(self.root, target, part.get("session"))
+        n = decide(self.root, flights, decision, reason=reason, author=author or this_user(), part=named)
+        with fleet_lock(self.root):
+            trends = update_drift(self.root)
+        return Decided(decision, tuple(flights["flight_id"].to_list()), n, trends)
+
+
+def this_user() -> str:
+    """Who runs this process, as its machine knows."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a container's user without a name
+        return "unknown"

@@ -11,7 +11,7 @@ from fieldcal.batch.sources import TRENDS, sources
 from fieldcal.config.configuration import Alerts
 from fieldcal.names import Json
 from fieldcal.provenance.run_key import run_key
-from fieldcal.schemas import TABLES
+from fieldcal.schemas import FLIGHT_TABLES, TABLES
 from fieldcal.schemas.arrow import VERSION_KEY
 from fieldcal.trends.changes import Change, changes, last_usable
 from fieldcal.warehouse import Warehouse
@@ -20,10 +20,12 @@ from fieldcal.warehouse.errors import disk
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import history_files
 from fieldcal.warehouse.lock import fleet_lock
+from fieldcal.warehouse.publish import settle
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 from fieldcal.warehouse.store import read_facts
+from fieldcal.warehouse.withdrawn import decisions
 
-INPUTS = ("calibration", "fit", "flight", "run", "sync")
+INPUTS = (*FLIGHT_TABLES, "decision")
 MOST_PAGES = 10
 
 
@@ -50,6 +52,8 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
     with fleet_lock(root):
         before = _remembered(root)
         _forget_other_versions(root)
+        for vehicle_id in decisions(root)["vehicle_id"].unique().sort().to_list():
+            settle(root, vehicle_id)  # where deciding was interrupted, rows do not follow yet
         former = Warehouse(root).scan("drift").collect()
         made_from = _made_from(root)
         if before.get("made_from") != made_from or before.get("made") != history_digest(root, ["drift"]):

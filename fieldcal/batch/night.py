@@ -14,7 +14,7 @@ from fieldcal.batch.documents import NightDocument
 from fieldcal.batch.log_ledger import write_ledger
 from fieldcal.batch.outcome import Outcome, summary
 from fieldcal.batch.plan import Plan, make_plan
-from fieldcal.batch.publish_flights import publish_vehicle, withdraw
+from fieldcal.batch.publish_flights import publish_vehicle, take_out
 from fieldcal.batch.sources import know_sources
 from fieldcal.config.configuration import Configuration
 from fieldcal.config.find import Source, configuration_of, find_source
@@ -94,7 +94,7 @@ class Publishing:
         flights = [(outcome.job, outcome.records) for outcome in self.outcomes]
         changed = publish_vehicle(self.root, self.vehicle_id, flights, self.configuration)
         for former, flight_ids in self.moved.items():
-            withdraw(self.root, former, flight_ids)
+            take_out(self.root, former, flight_ids)
         return list(changed)
 
 

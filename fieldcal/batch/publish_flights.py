@@ -57,7 +57,7 @@ def publish_vehicle(
     return publish(root, vehicle_id, {**own, **published_tables(made)} if stale else {}, stale | leaving)
 
 
-def withdraw(root: Path, vehicle_id: str, flights: set[str]) -> None:
+def take_out(root: Path, vehicle_id: str, flights: set[str]) -> None:
     """Take flights that moved elsewhere out of a vehicle's history."""
     publish(root, vehicle_id, {}, flights)
 

@@ -25,11 +25,13 @@ def export(
     params: Path | None = None,
     logged_raw: bool = False,
     system_id: int = 1,
+    author: str | None = None,
     output: Output = None,
     warehouse: Root = None,
     config: UnusedConfig = None,
 ) -> int:
-    """The constants to fly with: what the target cannot hold is told on stderr.
+    """The constants to fly with: what the target cannot hold is told on stderr. The history remembers what was exported
+    when, so that `fieldcal compare` tells whether it was loaded.
 
     Parameters
     ----------
@@ -48,6 +50,8 @@ def export(
         PX4, ArduPilot: states that nothing had corrected the readings before they were logged.
     system_id
         PX4: MAVLink's, of the vehicle.
+    author
+        Who exports; else the user who runs this.
     output
         File to write; else stdout.
     """
@@ -59,7 +63,8 @@ def export(
         told = f"--params and --logged-raw are for {' and '.join(AUTOPILOTS)}; {to} takes the constants as they are."
         raise fieldcal.FieldcalError(ReasonCode.WRONG_OPTION, told)
 
-    constants = fieldcal.Warehouse(warehouse).calibration_at(vehicle, at_temperature, unit=unit)
+    root = fieldcal.Warehouse(warehouse)
+    constants = root.calibration_at(vehicle, at_temperature, unit=unit)
     result = fieldcal.export(constants, to, parameters=params, logged_raw=logged_raw, system_id=system_id)
     for warning in result.warnings:
         say(warning)
@@ -67,6 +72,10 @@ def export(
         print(result.text, end="")
     else:
         write_bytes(output, result.text.encode())
+    try:
+        root.record_export(constants, to, result, author=author, temperature_degc=at_temperature)
+    except fieldcal.WarehouseError as error:
+        say(f"That it was exported is not remembered. {error}")
     return 0
 
 
@@ -81,7 +90,8 @@ def compare(
     warehouse: Root = None,
     config: UnusedConfig = None,
 ) -> int:
-    """What a vehicle's autopilot flies with beside what the history says, and whether it matters. Nothing is written.
+    """What a vehicle's autopilot flies with beside what the history says, and whether it matters; of what was exported
+    last, whether it was loaded. Nothing is written.
 
     Parameters
     ----------
@@ -99,12 +109,18 @@ def compare(
     from fieldcal.cli.show import console, print_json, table
     from fieldcal.exports.autopilots.comparison import COLUMNS, lines
 
-    constants = fieldcal.Warehouse(warehouse).calibration_at(vehicle, at_temperature)
+    root = fieldcal.Warehouse(warehouse)
+    constants = root.calibration_at(vehicle, at_temperature)
     rows = fieldcal.compare(constants, parameters=params, logged_raw=logged_raw)
+    exports = root.exports(vehicle)
     if as_json:
-        print_json([{**asdict(row), "sd": row.sd if row.sd == row.sd else None} for row in rows])
-    else:
-        console().print(table(COLUMNS, lines(rows), title=f"{vehicle}: what it flies with, and what is estimated"))
+        of = {(one.unit_id, one.sensor): asdict(one) for one in exports}
+        finite = [{**asdict(row), "sd": row.sd if row.sd == row.sd else None} for row in rows]
+        print_json([{**row, "exported": of.get((row["unit_id"], row["sensor"]))} for row in finite])
+        return 0
+    console().print(table(COLUMNS, lines(rows), title=f"{vehicle}: what it flies with, and what is estimated"))
+    for one in exports:
+        print(one.sentence)
     return 0
 
 

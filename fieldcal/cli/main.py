@@ -12,6 +12,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 import fieldcal
 from fieldcal.cli.config import config_app
+from fieldcal.cli.decide import accept, withdraw
 from fieldcal.cli.drift import drift
 from fieldcal.cli.fly import apply, compare, export
 from fieldcal.cli.interrupt import interruptible
@@ -396,4 +397,6 @@ app.command(simulate)
 app.command(drift)
 app.command(export)
 app.command(compare)
+app.command(withdraw)
+app.command(accept)
 app.command(apply)

@@ -4,12 +4,13 @@ target cannot hold."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from fieldcal.exports.autopilots.ardupilot import ardupilot
 from fieldcal.exports.autopilots.loading import Request
 from fieldcal.exports.autopilots.px4 import px4
 from fieldcal.exports.c_header import c_header
-from fieldcal.exports.calibration import Constants, Export
+from fieldcal.exports.calibration import Constants, Export, written
 from fieldcal.exports.json_document import json_document
 from fieldcal.exports.kalibr import kalibr
 from fieldcal.exports.ros import imu_calib, imu_pipeline, ros
@@ -35,4 +36,6 @@ def export_to(to: str, constants: Constants, request: Request | None = None) -> 
     FieldcalError
         `not_loadable`: an autopilot cannot take them, or must not without knowing more.
     """
-    return AUTOPILOTS[to](constants, request) if to in AUTOPILOTS else PROGRAMS[to](constants)
+    if to in AUTOPILOTS:
+        return AUTOPILOTS[to](constants, request)
+    return replace(PROGRAMS[to](constants), written=written(constants))

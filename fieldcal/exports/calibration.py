@@ -192,8 +192,41 @@ class Constants:
 
 
 @dataclass(frozen=True)
+class Written:
+    """A number that was handed out to fly with.
+
+    Attributes
+    ----------
+    unit_id, sensor : str
+        Whose.
+    name : str
+        The autopilot's parameter; in other formats the constant and its axes, as zero_x or scale_xy.
+    value : float
+        As its target has it.
+
+    Examples
+    --------
+    >>> Written("b/1", "gyroscope", "CAL_GYRO0_XOFF", 0.01).name
+    'CAL_GYRO0_XOFF'
+    """
+
+    unit_id: str
+    sensor: str
+    name: str
+    value: float
+
+
+@dataclass(frozen=True)
 class Export:
     """A text in somebody else's format, and what that format cannot hold.
+
+    Attributes
+    ----------
+    text : str
+    warnings : tuple of str
+        What the target cannot hold, and what is left to do.
+    written : tuple of Written
+        The numbers in the text, sensor by sensor.
 
     Examples
     --------
@@ -204,3 +237,22 @@ class Export:
 
     text: str
     warnings: tuple[str, ...]
+    written: tuple[Written, ...] = ()
+
+
+def written(constants: Constants) -> tuple[Written, ...]:
+    """The constants themselves, as a format other than an autopilot's has them."""
+    axes = "xyz"
+    return tuple(
+        Written(constants.unit_ids.get(sensor, ""), sensor, name, float(value))
+        for sensor, triad in constants.triads.items()
+        for name, value in (
+            *((f"zero_{axis}", triad.zero[i]) for i, axis in enumerate(axes)),
+            *(
+                (f"scale_{a}" if i == j else f"scale_{a}{b}", triad.scale[i, j])
+                for i, a in enumerate(axes)
+                for j, b in enumerate(axes)
+                if i == j or not triad.diagonal
+            ),
+        )
+    )

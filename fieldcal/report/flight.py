@@ -20,7 +20,7 @@ from fieldcal.schemas.rows import CalibrationRow, FitRow, UnfoldedFlight, Unfold
 from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
 from fieldcal.stages.composition import ORIGIN
 from fieldcal.stages.tables import AXES
-from fieldcal.words.flights import QUANTITIES, advised, is_consequence, sync_sentence
+from fieldcal.words.flights import QUANTITIES, advised, decision_sentence, is_consequence, sync_sentence
 from fieldcal.words.numbers import cell, number
 from fieldcal.words.rows import BESIDE, standing, typed
 
@@ -79,7 +79,7 @@ def flight_page(data: FlightData, links: Links) -> Page:
 
 def _refusals(data: FlightData) -> list[Part]:
     flight = data.flight
-    parts: list[Part] = []
+    parts: list[Part] = [Notice(decision_sentence(row)) for row in data.decisions]
     if flight["reason"]:
         parts.append(Notice(f"{flight['verdict']} ({flight['reason_code']}): {flight['reason']}"))
     findings = [f for f in flight["findings"] or [] if f["sentence"] != flight["reason"]]

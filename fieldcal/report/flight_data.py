@@ -15,12 +15,13 @@ from fieldcal.flight.rows import rows_frame
 from fieldcal.names import InitialAttitude, Json, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import SIGNAL_TABLES, SchemaMismatch
-from fieldcal.schemas.rows import FitRow, SyncRow, UnfoldedFlight, UnfoldedRun
+from fieldcal.schemas.rows import DecisionRow, FitRow, SyncRow, UnfoldedFlight, UnfoldedRun
 from fieldcal.stages.composition import in_log
 from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.stage_store import StageStore, outputs_of
+from fieldcal.warehouse.withdrawn import decisions
 from fieldcal.words.rows import rows_of, typed, unfolded
 
 STAGE_TABLES = (
@@ -46,6 +47,7 @@ class FlightData:
     JSON, `settings` what the figures need of them, None where they do not say.
 
     `gone` names stages whose tables should be there and are not. `further`: rows of `calibration` of further units.
+    `decisions`: what people decided about it, the first first.
     """
 
     flight: UnfoldedFlight
@@ -58,6 +60,7 @@ class FlightData:
     settings: FigureSettings | None
     gone: tuple[str, ...] = field(default=())
     further: pl.DataFrame = field(default_factory=lambda: rows_frame("calibration", ()))
+    decisions: Sequence[DecisionRow] = field(default=())
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -101,6 +104,7 @@ def read_flight(root: Path, flight_id: str) -> FlightData:
         from_json(parameters, FigureSettings),
         gone,
         every["calibration"].filter(~pl.col("is_primary")),
+        typed(decisions(root).filter(flight_id=flight["flight_id"]).iter_rows(named=True), DecisionRow),
     )
 
 

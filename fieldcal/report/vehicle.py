@@ -11,6 +11,7 @@ import polars as pl
 from fieldcal.errors import FieldcalError
 from fieldcal.exports.autopilots.comparison import COLUMNS, compared, lines
 from fieldcal.exports.calibration_at import constants_of
+from fieldcal.exports.handed_out import handed_out
 from fieldcal.names import GRAVEST_FIRST, SENSORS, DriftStatus, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.report.history import LatestCalibration, RefusedRow, as_of_sentence, newest, reason_of, usable_flights
@@ -21,11 +22,13 @@ from fieldcal.report.vehicle_figures import MOST_POINTS, agreement_plot, lag_plo
 from fieldcal.report.words import PARAMETERS, age, count, day, plain_name, preferred, scientific, unit
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import REFERENCE_DEGC
-from fieldcal.schemas.rows import DriftRow, UnfoldedFlight
+from fieldcal.schemas.rows import DecisionRow, DriftRow, UnfoldedFlight
 from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
 from fieldcal.stages.beside.warm_up import PARAMETER as WARM_UP_SLOPE
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.questions import existing, units_flown
+from fieldcal.warehouse.withdrawn import decisions
+from fieldcal.words.flights import decision_sentence
 from fieldcal.words.numbers import number
 from fieldcal.words.rows import typed, unfolded
 
@@ -64,6 +67,7 @@ def vehicle_page(root: Path, vehicle_id: str, links: Links, as_of: datetime | No
         Section("agreement", "Agreement", _agreement(warehouse, vehicle_id)),
         Section("clock", "VPS clock", _clock(warehouse, vehicle_id)),
         Section("flights", "Flights", [_flights(flights, usable, links)]),
+        *_decisions(flights, root, links),
         Section("refusals", "Refusals", _refusals(warehouse, vehicle_id, flown, links)),
     ]
     return Page(
@@ -143,11 +147,12 @@ def _before_and_after(root: Path, vehicle_id: str) -> list[Part]:
         return []
     numeric = ("flies with", "estimate", "difference", "which is")
     return [
+        *(Text(one.sentence) for one in handed_out(root, vehicle_id)),
         Table(
             "What the autopilot flew with beside what is estimated (fieldcal compare)",
             tuple(Column(name, "n") if name in numeric else Column(name) for name in COLUMNS),
             lines(rows),
-        )
+        ),
     ]
 
 
@@ -331,6 +336,21 @@ def _flights(flights: pl.DataFrame, usable: pl.DataFrame, links: Links) -> Table
         else ""
     )
     return Table("Flights, the latest first (fieldcal report --flight ID writes a flight's page)", columns, lines, more)
+
+
+def _decisions(flights: pl.DataFrame, root: Path, links: Links) -> list[Section]:
+    """What people decided about its flights, the last first; nothing where nobody did."""
+    decided = decisions(root).filter(pl.col("flight_id").is_in(flights["flight_id"].to_list())).reverse()
+    if decided.is_empty():
+        return []
+    lines = [
+        [links.to(flight_name(r["flight_id"]), r["flight_id"]), day(r["decided_at"]), decision_sentence(r)]
+        for r in typed(decided.head(REFUSALS).iter_rows(named=True), DecisionRow)
+    ]
+    columns = (Column("flight"), Column("decided (UTC)", "nowrap"), Column("what and why", "wide"))
+    more = f'{decided.height - REFUSALS} more: fieldcal sql "FROM decision".' if decided.height > REFUSALS else ""
+    table = Table("What people decided (fieldcal withdraw, fieldcal accept), the last first", columns, lines, more)
+    return [Section("decisions", "Decisions", [table])]
 
 
 def _refusals(warehouse: Warehouse, vehicle_id: str, flown: pl.DataFrame, links: Links) -> list[Part]:

@@ -19,6 +19,7 @@ from fieldcal.trends.regression import Trends
 from fieldcal.trends.series import Histories
 from fieldcal.trends.temperature_curve import ORDER, Curve, about_reference, combined, of_sessions, together, widening
 from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.withdrawn import decisions, withdrawn_flights
 
 Source = tuple[Array, Array]
 """Coefficients (3,) at 25 °C and their information (3, 3)."""
@@ -47,7 +48,14 @@ class Bent:
 
 def bends_of(root: Path) -> Bends:
     """Every warm-up flight's curve, from the measured numbers of its run."""
-    runs = Warehouse(root).scan("run").filter((pl.col("stage") == METHOD) & (pl.col("status") == Status.OK))
+    runs = (
+        Warehouse(root)
+        .scan("run")
+        .filter(
+            (pl.col("stage") == METHOD) & (pl.col("status") == Status.OK),
+            ~pl.col("flight_id").is_in(withdrawn_flights(decisions(root))),
+        )
+    )
     found: dict[tuple[str, str, str], Source] = {}
     for flight_id, unit_id, text in runs.select("flight_id", "unit_id", "measured").collect().iter_rows():
         curve = json.loads(text or "{}").get(CURVE)

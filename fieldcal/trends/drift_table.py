@@ -10,7 +10,7 @@ import polars as pl
 
 from fieldcal.names import GRAVEST_FIRST, RESIDUAL, Status
 from fieldcal.provenance.run_key import run_key, source_digest
-from fieldcal.schemas import TABLES, table_key
+from fieldcal.schemas import FLIGHT_TABLES, TABLES, table_key
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import ENOUGH_SESSIONS
 from fieldcal.schemas.rows import DriftRow
@@ -27,6 +27,7 @@ from fieldcal.warehouse.layout import history_files, vehicle_of
 from fieldcal.warehouse.publish import publish
 from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.store import empty_frame, read_table
+from fieldcal.warehouse.withdrawn import decisions, withdrawn_flights
 from fieldcal.words.rows import typed
 
 KEY = list(table_key("drift"))
@@ -137,6 +138,7 @@ def history_of_everything(root: Path) -> pl.DataFrame:
     fit = (
         warehouse.scan("fit")
         .filter((pl.col("signal") == "raw") & (pl.col("sample") == "all"))
+        .filter(~pl.col("flight_id").is_in(withdrawn_flights(decisions(root))))
         .join(warm, on=flight, how="left")
         .with_columns(
             sensor=pl.lit(AGREEMENT),
@@ -249,7 +251,7 @@ def _moments(day: np.ndarray) -> pl.Series:
 
 def _state(root: Path) -> list[tuple[str, int, int, int]]:
     """What the files of the history are; they are replaced whole, so another content is another file."""
-    files = [path for table in ("calibration", "flight", "run", "sync", "fit") for path in history_files(root, table)]
+    files = [path for table in (*FLIGHT_TABLES, "decision") for path in history_files(root, table)]
     return [(str(path), (s := path.stat()).st_ino, s.st_size, s.st_mtime_ns) for path in files]
 
 

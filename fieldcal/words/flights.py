@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fieldcal.names import Status, Verdict
+from fieldcal.names import Decision, Status, Verdict
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.schemas.rows import Refusable, SyncRow, UnfoldedFlight, UnfoldedRun
+from fieldcal.schemas.rows import DecisionRow, Refusable, SyncRow, UnfoldedFlight, UnfoldedRun
 from fieldcal.words.numbers import number, with_sd
 
 QUANTITIES = {
@@ -34,6 +34,13 @@ def advised(runs: Sequence[UnfoldedRun]) -> list[str]:
     """What would make weak constants better, by the stages that found them (a refused stage says it in its reason)."""
     told = (run["measured"].get("advice") for run in runs if run["status"] == Status.OK)
     return [str(advice) for advice in told if advice]
+
+
+def decision_sentence(row: DecisionRow) -> str:
+    """What somebody decided about a flight, and why."""
+    part = " ".join(filter(None, (row["unit_id"], row["sensor"], row["parameter"], row["axis"])))
+    done = {Decision.WITHDRAW: "Withdrawn", Decision.ACCEPT: "Accepted"}[Decision(row["decision"])]
+    return f"{done}{f', {part}' if part else ''}: {row['reason']} ({row['author']}, {row['decided_at']:%Y-%m-%d})"
 
 
 def is_consequence(run: Refusable) -> bool:

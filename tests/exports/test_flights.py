@@ -4,66 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from history_rows import lead, rows
+from autopilot_rows import PARAMETERS, composition, gyroscope, history, origin
+from history_rows import lead
 
 import fieldcal
 from fieldcal.cli.main import run
 from fieldcal.exports.calibration_at import constants_of
 from fieldcal.names import Sensor
 from fieldcal.report import write_vehicle_report
-from fieldcal.warehouse.publish import publish
-
-PARAMETERS = {"CAL_GYRO0_ID": 11.0, "CAL_GYRO1_ID": 12.0, "CAL_GYRO0_XOFF": 0.02, "CAL_GYRO1_XOFF": 0.5}
-NOT_TURNED = np.eye(3).tolist()
-
-
-def gyroscope(first: dict[str, Any], value: float, status: str = "ok") -> list[dict[str, Any]]:
-    """Scale 1.01 and a zero, ± 1 mrad/s, of one flight at 31 °C."""
-    common = {
-        **first,
-        "sensor": "gyroscope",
-        "method": "joint",
-        "status": status,
-        "temperature_degc": 31.0,
-        "sd": 1e-3,
-    }
-    return [
-        {**common, "parameter": parameter, "axis": axis, "unit": unit, "value": number}
-        for parameter, unit, number in (("scale", "1", 1.01), ("zero", "rad/s", value))
-        for axis in "xyz"
-    ]
-
-
-def origin(device_id: int | None, **changes: Any) -> dict[str, Any]:
-    loaded = {"autopilot": "px4", "device_id": device_id, "rotation": NOT_TURNED, "parameters": PARAMETERS}
-    return {
-        "body": "frd",
-        "gravity_sign": "specific_force",
-        "rotation_body_from_sensor": NOT_TURNED,
-        "horizontal_field_g": None,
-        "loaded": {} if device_id is None else {"gyroscope": loaded},
-        **changes,
-    }
-
-
-def composition(first: dict[str, Any], told: dict[str, Any] | None) -> dict[str, Any]:
-    measured = {} if told is None else {"origin": told}
-    return {**first, "stage": "composition", "status": "ok", "measured": json.dumps(measured), "run_key": "k" * 32}
-
-
-def history(root: Path, *flights: tuple[list[dict[str, Any]], list[dict[str, Any]]]) -> Path:
-    for constants, runs in flights:
-        tables = {
-            "calibration": rows("calibration", *constants),
-            "run": rows("run", *runs),
-            "flight": rows("flight", {**runs[0], "log_uri": "x", "verdict": "ok", "imu_rate_hz": 187.0}),
-        }
-        publish(root, "v", tables, [runs[0]["flight_id"]])
-    return root
 
 
 def two_units(root: Path) -> Path:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from importlib.resources import files
 
 from fieldcal.names import PREFERRED_METHODS
-from fieldcal.schemas.reference import ENOUGH_SESSIONS, REFERENCE_DEGC, UNCONFIRMED_SD
+from fieldcal.schemas.reference import ENOUGH_SESSIONS, REFERENCE_DEGC, SAME_VALUE, UNCONFIRMED_SD
 
 VALUES = {
     "reference_degc": f"{REFERENCE_DEGC:g}",
     "enough_sessions": str(ENOUGH_SESSIONS),
     "unconfirmed_sd": f"{UNCONFIRMED_SD:g}",
+    "same_value": f"{SAME_VALUE:g}",
     "exactness": " ".join(
         f"WHEN '{method}' THEN {len(PREFERRED_METHODS) - place}" for place, method in enumerate(PREFERRED_METHODS)
     ),

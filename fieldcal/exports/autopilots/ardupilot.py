@@ -29,7 +29,7 @@ from fieldcal.exports.autopilots.ardupilot_slot import KIND, ArduPilot, compass_
 from fieldcal.exports.autopilots.loading import Loadable, Request, loadable
 from fieldcal.exports.autopilots.thermal import Curve, curve_to_load, slope_span
 from fieldcal.exports.autopilots.units import SHOWN_UNIT, dropped_rotation, not_held
-from fieldcal.exports.calibration import Constants, Export
+from fieldcal.exports.calibration import Constants, Export, Written
 from fieldcal.geometry.rotation import Array
 from fieldcal.logs.dataflash.corrections import COMPASS_SCALE_RANGE, THERMAL_REFERENCE_DEGC, THERMAL_SCALE
 from fieldcal.logs.dataflash.parameters import compass_names, inertial_names
@@ -54,19 +54,25 @@ def ardupilot(constants: Constants, request: Request | None = None) -> Export:
     found, told = loadable(constants, ArduPilot(), request or Request())
     rows: list[Row] = []
     kept: list[Loadable] = []
+    written: list[Written] = []
     for one in found:
         own, more = _compass(one) if one.sensor == Sensor.MAGNETOMETER else _inertial(one)
         rows += own
+        written += _written(one, own)
         told += more
         kept += [one] if own else []
     for slot in sorted({one.slot for one in kept if one.sensor in KIND}):
-        own, more = _thermal(slot, {one.sensor: one for one in kept if one.slot == slot and one.sensor in KIND})
+        own_sensors = {one.sensor: one for one in kept if one.slot == slot and one.sensor in KIND}
+        own, more = _thermal(slot, own_sensors)
         rows += own
+        for sensor, one in own_sensors.items():
+            others = {name for kind in KIND.values() if kind != KIND[sensor] for name in _terms(kind, slot)}
+            written += _written(one, [row for row in own if row[0] not in others])
         told += more
     told += _by_itself(kept)
     told.append("Reboot it after loading.")
     text = "\n".join([f"# {constants.heading}", *(f"{name},{_number(value)}" for name, value in rows)])
-    return Export(text + "\n", tuple(told))
+    return Export(text + "\n", tuple(told), tuple(written))
 
 
 def _inertial(one: Loadable) -> tuple[list[Row], list[str]]:
@@ -179,6 +185,15 @@ def _beyond(names: Iterable[str], values: Array, low: float, high: float) -> str
         if not low <= value <= high:
             return f"{name} of {value:.4g} is beyond the {low:.4g} to {high:.4g} that it takes."
     return None
+
+
+def _terms(kind: str, slot: int) -> list[str]:
+    """Parameters of a thermal block that are one sensor's alone."""
+    return [name for names in inertial_names(kind, slot).thermal for name in names]
+
+
+def _written(one: Loadable, rows: Iterable[Row]) -> list[Written]:
+    return [Written(one.unit_id, str(one.sensor), name, value) for name, value in rows]
 
 
 def _named(names: Iterable[str], values: Array) -> list[Row]:

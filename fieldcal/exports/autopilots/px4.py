@@ -23,7 +23,7 @@ from fieldcal.exports.autopilots.loading import Loadable, Request, loadable
 from fieldcal.exports.autopilots.px4_slot import Px4, signed, thermal_block, thermal_slot
 from fieldcal.exports.autopilots.thermal import curve_to_load, slope_span
 from fieldcal.exports.autopilots.units import SHOWN_UNIT, dropped_rotation, not_held
-from fieldcal.exports.calibration import Constants, Export
+from fieldcal.exports.calibration import Constants, Export, Written
 from fieldcal.geometry.rotation import Array
 from fieldcal.logs.ulog.parameters import AXES, BY_ITSELF, CALIBRATION, THERMAL
 from fieldcal.names import Sensor
@@ -45,9 +45,11 @@ def px4(constants: Constants, request: Request | None = None) -> Export:
     asked = request or Request()
     found, told = loadable(constants, Px4(), asked)
     rows: list[Row] = []
+    written: list[Written] = []
     for one in found:
         own, more = _sensor(one)
         rows += own
+        written += [Written(one.unit_id, str(one.sensor), name, float(value)) for name, value, _ in own]
         told += more
     rows = list(dict.fromkeys(rows))  # TC_A_ENABLE of several slots
     told += _by_itself(found)
@@ -63,7 +65,7 @@ def px4(constants: Constants, request: Request | None = None) -> Export:
             for name, value, kind in rows
         ),
     ]
-    return Export("\n".join(lines) + "\n", tuple(told))
+    return Export("\n".join(lines) + "\n", tuple(told), tuple(written))
 
 
 def _sensor(one: Loadable) -> tuple[list[Row], list[str]]:
