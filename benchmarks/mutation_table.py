@@ -117,13 +117,13 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): _LENGTH,
     ("estimation.smoothing", "low_pass", "shape = (-1,) + (1,) * (x.ndim - 1)", "1 → 2"): _ANY_NEGATIVE,
     (
-        "exports.apply",
-        "write_parquet",
+        "exports.calibrated_files",
+        "write_folder",
         "values = c.readings[name][1] if name in own else np.full((len(t_ns), 3), np.nan)",
         "3 → 4",
     ): _THREE_TAKEN,
     (
-        "exports.apply",
+        "exports.calibrated_files",
         "write_ros",
         "nothing = np.full((len(either[0]), 3), np.nan)",
         "0 → 1",
