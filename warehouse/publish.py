@@ -18,12 +18,12 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import FLIGHT_TABLES, HISTORY_TABLES, SchemaMismatch
 from fieldcal.schemas.columns import SEQUENCE, STARTED_AT
 from fieldcal.warehouse import checksums
+from fieldcal.warehouse.decisions.withdrawn import DECIDED, as_decided, decisions
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import checksum_path, history_path
 from fieldcal.warehouse.lock import vehicle_lock
 from fieldcal.warehouse.store import conform, empty_frame, frame, read_arrow, read_table, table_bytes
-from fieldcal.warehouse.withdrawn import DECIDED, as_decided, decisions
 
 _ORDER = (*(name for name in FLIGHT_TABLES if name != "flight"), "drift", "flight")
 

@@ -11,7 +11,7 @@ from fieldcal.errors import FieldcalError
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.warehouse import Warehouse, WarehouseError
-from fieldcal.warehouse.withdrawn import decisions, withdrawn_flights
+from fieldcal.warehouse.decisions.withdrawn import decisions, withdrawn_flights
 
 COLUMNS = (
     "started_at",

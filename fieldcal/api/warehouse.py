@@ -22,7 +22,13 @@ if TYPE_CHECKING:
 
 
 class Part(TypedDict, total=False):
-    """What of a target a decision is about; None: everything."""
+    """What of a target a decision is about; None: everything.
+
+    Examples
+    --------
+    >>> Part(sensor="gyroscope", axis="z")
+    {'sensor': 'gyroscope', 'axis': 'z'}
+    """
 
     session: str | None
     unit: str | None
@@ -216,7 +222,7 @@ class Warehouse(query.Warehouse):
 
     def _decide(self, decision: Decision, target: str, reason: str, author: str | None, part: Part) -> Decided:
         from fieldcal.trends.drift_table import update_drift
-        from fieldcal.warehouse.decisions import decide, flights_meant
+        from fieldcal.warehouse.decisions.decide import decide, flights_meant
         from fieldcal.warehouse.lock import fleet_lock
 
         columns = {"unit_id": part.get("unit"), **{name: part.get(name) for name in ("sensor", "parameter", "axis")}}

@@ -16,6 +16,7 @@ from fieldcal.schemas.arrow import VERSION_KEY
 from fieldcal.trends.changes import Change, changes, last_usable
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.checksums import history_digest
+from fieldcal.warehouse.decisions.withdrawn import decisions
 from fieldcal.warehouse.errors import disk
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import history_files
@@ -23,7 +24,6 @@ from fieldcal.warehouse.lock import fleet_lock
 from fieldcal.warehouse.publish import settle
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 from fieldcal.warehouse.store import read_facts
-from fieldcal.warehouse.withdrawn import decisions
 
 INPUTS = (*FLIGHT_TABLES, "decision")
 MOST_PAGES = 10

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from fieldcal.cli.present_night import print_night
-from fieldcal.cli.progress import NightProgress
+from fieldcal.cli.present.night import print_night
+from fieldcal.cli.present.progress import NightProgress
 from fieldcal.cli.show import console, table
 from fieldcal.flows.run import run_night
 from fieldcal.names import SENSORS, Status, exactness

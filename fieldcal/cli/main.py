@@ -106,7 +106,7 @@ def calibrate(
     if as_json:
         print_json(result.document)
     else:
-        from fieldcal.cli.present_flight import print_flight
+        from fieldcal.cli.present.flight import print_flight
 
         print_flight(console(), result.document)
     return OK if result.verdict == Verdict.OK else LOSSES
@@ -344,18 +344,18 @@ def _night(
         if as_json:
             print_json(plan)
         else:
-            from fieldcal.cli.present_night import print_plan
+            from fieldcal.cli.present.night import print_plan
 
             print_plan(console(), plan)
         return OK
-    from fieldcal.cli.progress import NightProgress
+    from fieldcal.cli.present.progress import NightProgress
 
     with NightProgress() as progress:
         result = run_night(archive, root, config, folder, workers, progress, **where)
     if as_json:
         print_json(result)
     else:
-        from fieldcal.cli.present_night import print_night
+        from fieldcal.cli.present.night import print_night
 
         print_night(console(), result, root)
     return OK if result["ok"] == len(result["logs"]) else LOSSES

@@ -15,7 +15,7 @@ from fieldcal.names import Rotation
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.stages.composition import ORIGIN
 from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.withdrawn import decisions, withdrawn_flights
+from fieldcal.warehouse.decisions.withdrawn import decisions, withdrawn_flights
 
 
 class Flights:

@@ -19,9 +19,9 @@ from fieldcal.schemas.rows import DecisionRow, FitRow, SyncRow, UnfoldedFlight, 
 from fieldcal.stages.composition import in_log
 from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.warehouse import Warehouse, WarehouseError
+from fieldcal.warehouse.decisions.withdrawn import decisions
 from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.stage_store import StageStore, outputs_of
-from fieldcal.warehouse.withdrawn import decisions
 from fieldcal.words.rows import rows_of, typed, unfolded
 
 STAGE_TABLES = (

@@ -26,8 +26,8 @@ from fieldcal.schemas.rows import DecisionRow, DriftRow, UnfoldedFlight
 from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
 from fieldcal.stages.beside.warm_up import PARAMETER as WARM_UP_SLOPE
 from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.decisions.withdrawn import decisions
 from fieldcal.warehouse.questions import existing, units_flown
-from fieldcal.warehouse.withdrawn import decisions
 from fieldcal.words.flights import decision_sentence
 from fieldcal.words.numbers import number
 from fieldcal.words.rows import typed, unfolded

@@ -19,7 +19,7 @@ from fieldcal.trends.regression import Trends
 from fieldcal.trends.series import Histories
 from fieldcal.trends.temperature_curve import ORDER, Curve, about_reference, combined, of_sessions, together, widening
 from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.withdrawn import decisions, withdrawn_flights
+from fieldcal.warehouse.decisions.withdrawn import decisions, withdrawn_flights
 
 Source = tuple[Array, Array]
 """Coefficients (3,) at 25 °C and their information (3, 3)."""

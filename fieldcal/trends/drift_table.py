@@ -23,11 +23,11 @@ from fieldcal.trends.reasons import AGREEMENT, VPS, reason
 from fieldcal.trends.series import Histories
 from fieldcal.trends.warm_up_slopes import slopes_of_warm_ups
 from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.decisions.withdrawn import decisions, withdrawn_flights
 from fieldcal.warehouse.layout import history_files, vehicle_of
 from fieldcal.warehouse.publish import publish
 from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.store import empty_frame, read_table
-from fieldcal.warehouse.withdrawn import decisions, withdrawn_flights
 from fieldcal.words.rows import typed
 
 KEY = list(table_key("drift"))

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from fieldcal.cli.present_flight import fit_table, print_refusals
+from fieldcal.cli.present.flight import fit_table, print_refusals
 from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.stages.stage import run_stage
 from fieldcal.words.flights import advised, is_consequence

@@ -177,7 +177,7 @@ def test_a_full_disk_ends_the_night_with_a_sentence(
 UNPRIVILEGED = """
 import json, os, sys
 from pathlib import Path
-import fieldcal.flight.calibrate, fieldcal.cli.doctor, fieldcal.cli.show, fieldcal.cli.present_night
+import fieldcal.flight.calibrate, fieldcal.cli.doctor, fieldcal.cli.show, fieldcal.cli.present.night
 import fieldcal.warehouse.query, fieldcal.warehouse.questions
 from fieldcal.batch.flights import flights
 from fieldcal.batch.jobs import find_jobs

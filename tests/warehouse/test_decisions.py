@@ -14,13 +14,14 @@ from fieldcal.batch.closing import close_night
 from fieldcal.config.configuration import Alerts
 from fieldcal.errors import FieldcalError
 from fieldcal.names import Decision
-from fieldcal.warehouse import Warehouse, decisions
+from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.content import content_sha256
+from fieldcal.warehouse.decisions import decide as decisions
+from fieldcal.warehouse.decisions.withdrawn import as_decided, withdrawn_flights
+from fieldcal.warehouse.decisions.withdrawn import decisions as standing
 from fieldcal.warehouse.publish import append, publish, read_history, settle
 from fieldcal.warehouse.questions import units_flown
 from fieldcal.warehouse.verify import verify
-from fieldcal.warehouse.withdrawn import as_decided, withdrawn_flights
-from fieldcal.warehouse.withdrawn import decisions as standing
 
 NOW = dt.datetime(2026, 7, 1, tzinfo=dt.UTC)
 FLIGHTS = [f"{n}{n:0>15}" for n in range(1, 7)]

@@ -14,11 +14,11 @@ from fieldcal.names import Decision
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.rows import DecisionRow
+from fieldcal.warehouse.decisions.withdrawn import PARTS
 from fieldcal.warehouse.publish import append, settle
 from fieldcal.warehouse.query import Warehouse
 from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.store import empty_frame
-from fieldcal.warehouse.withdrawn import PARTS
 
 LEAST_PREFIX = 6
 """Characters of a flight's id by which it may be called, where no other begins so."""

@@ -1,0 +1,1 @@
+"""What people decide about flights, and what that makes of the history."""
