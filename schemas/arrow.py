@@ -7,13 +7,18 @@ from collections.abc import Mapping
 import pyarrow as pa
 
 from fieldcal.schemas.column import AS_LOGGED
-from fieldcal.schemas.rows import IN_OLDER_ROWS, may_be_null
+from fieldcal.schemas.migrations import fillings
+from fieldcal.schemas.rows import may_be_null
 from fieldcal.schemas.tables import TABLES, table_columns, table_key
 
 TABLE_KEY = "fieldcal.table"
 VERSION_KEY = "fieldcal.schema_version"
 
-_MADE_ANEW = "Move this table's files away and run the night: they are made anew from the logs that the archive holds"
+_UPGRADE = (
+    "An older fieldcal wrote it: run `fieldcal upgrade`; move away a file that it leaves, and run the night: it is "
+    "made anew from the archive's logs"
+)
+_UPDATE = "A newer fieldcal wrote it: update fieldcal"
 
 
 class SchemaMismatch(ValueError):
@@ -57,7 +62,8 @@ def arrow_schema(
 
 
 def check(schema: pa.Schema, table: str, *, stage: bool = False) -> tuple[str, ...]:
-    """Columns that a file lacks because an older version wrote it. What its rows have there: `rows.IN_OLDER_ROWS`.
+    """Columns that a file lacks because an older version wrote it. What its rows have there:
+    `migrations.fillings`.
 
     Raises
     ------
@@ -92,7 +98,7 @@ def check(schema: pa.Schema, table: str, *, stage: bool = False) -> tuple[str, .
         return absent
     remedy = ""
     if version != known:
-        remedy = ". A newer fieldcal wrote it: install that" if version > known else f". {_MADE_ANEW}"
+        remedy = f". {_UPDATE if version > known else _UPGRADE}"
     raise SchemaMismatch(f"this is not the table {table}: {'; '.join(differences)}{remedy}")
 
 
@@ -100,7 +106,7 @@ def _dispensable(table: str) -> frozenset[str]:
     """Columns that rows of an older version may lack. A stage's own tables are made anew with its code."""
     definition = TABLES[table]
     if definition.kind == "history":
-        return may_be_null(table) | IN_OLDER_ROWS.keys()
+        return may_be_null(table) | fillings(table).keys()
     return frozenset(definition.column_names) - {*definition.key} if definition.kind == "signal" else frozenset()
 
 

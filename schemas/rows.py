@@ -232,11 +232,6 @@ ROWS = {
 }
 
 
-IN_OLDER_ROWS: Mapping[str, str | bool] = {"unit_id": "imu_id", "is_primary": True}
-"""What rows of a version without these columns have in them, the one unit that a flight had then: of a text, what the
-column of this name has. In other columns that they lack they have null."""
-
-
 def may_be_null(table: str) -> frozenset[str]:
     """Columns of a table of the history that a row may have no value in."""
     return frozenset(name for name, hint in get_type_hints(ROWS[table]).items() if NoneType in get_args(hint))

@@ -172,7 +172,7 @@ _HISTORY = (
     Table(
         "calibration",
         "history",
-        2,
+        3,
         "one row a unit, sensor, method, parameter and axis of a flight",
         (*c.LEAD, *_UNIT, *_CONSTANTS, c.RUN_KEY),
         ("flight_id", "unit_id", "sensor", "method", "parameter", "axis"),
@@ -180,7 +180,7 @@ _HISTORY = (
     Table(
         "fit",
         "history",
-        2,
+        3,
         "one row a unit, quantity, method and reference of a flight: how well they agree",
         (
             *c.LEAD,
@@ -204,7 +204,7 @@ _HISTORY = (
     Table(
         "sync",
         "history",
-        2,
+        3,
         "one row a unit of a flight with VPS: the VPS's clock against the IMU's",
         (
             *c.LEAD,
@@ -224,7 +224,7 @@ _HISTORY = (
     Table(
         "run",
         "history",
-        2,
+        3,
         "one row a unit and stage of a flight: the execution that made the result",
         (*c.LEAD, *_UNIT, c.STAGE, c.STATUS, c.REASON_CODE, c.MEASURED, c.RUN_KEY, c.VERSIONS),
         ("flight_id", "unit_id", "stage"),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Unpack
 import polars as pl
 
 from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES, signal_kind
-from fieldcal.schemas.rows import IN_OLDER_ROWS
+from fieldcal.schemas.migrations import fillings
 from fieldcal.warehouse.checksums import assure
 from fieldcal.warehouse.layout import encode_id, history_files, history_path, signal_files, signal_path
 from fieldcal.warehouse.signals import signal_ids
@@ -91,7 +91,8 @@ class Warehouse:
 def _scan(files: Sequence[Path], table: str) -> pl.LazyFrame:
     """Rows of a table's files, also where columns are younger than a file (`schemas.check`)."""
     columns, forms = TABLES[table].column_names, by_absent_columns(files, table)
-    younger = {name: pl.col(has) if isinstance(has, str) else pl.lit(has) for name, has in IN_OLDER_ROWS.items()}
+    known = {name: has for name, has in fillings(table).items() if has is not None}
+    younger = {name: pl.col(has) if isinstance(has, str) else pl.lit(has) for name, has in known.items()}
     parts = [
         pl.scan_parquet(paths, hive_partitioning=False, glob=False)
         .with_columns(**{name: value for name, value in younger.items() if name in absent})

@@ -27,7 +27,7 @@ def seal(record: Mapping[str, object]) -> bytes:
     body = {key: value for key, value in record.items() if key != _SEAL}
     if not body:
         raise ValueError("an empty record has nothing to seal")
-    text = (json.dumps(body, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n").encode()
+    text = _text(body)
     return text.removesuffix(_END) + _last_line(text)
 
 
@@ -40,7 +40,7 @@ def unseal(data: bytes) -> dict[str, Json]:
         A byte differs from what was written.
     """
     head, comma, _ = data.rpartition(b",\n")
-    if not comma or head + _last_line(head + _END) != data:
+    if (not comma or head + _last_line(head + _END) != data) and not _formerly_sealed(data):
         raise BrokenSeal("it is not what was written")
     try:
         record: dict[str, Json] = json.loads(data)
@@ -48,6 +48,20 @@ def unseal(data: bytes) -> dict[str, Json]:
         raise BrokenSeal("it is not JSON") from error
     del record[_SEAL]
     return record
+
+
+def _formerly_sealed(data: bytes) -> bool:
+    """Whether it is as the first nights wrote it: the digest among the other keys, in their order."""
+    try:
+        record = json.loads(data)
+        digest = record.pop(_SEAL)
+        return hashlib.sha256(_text(record)).hexdigest() == digest and _text({**record, _SEAL: digest}) == data
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):  # whatever a torn file may hold
+        return False
+
+
+def _text(record: Mapping[str, object]) -> bytes:
+    return (json.dumps(record, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n").encode()
 
 
 def _last_line(text: bytes) -> bytes:

@@ -7,8 +7,8 @@ both. Floats are dictionary-encoded, time stamps delta-encoded, pages compressed
 from __future__ import annotations
 
 import io
-from collections.abc import Collection, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeAlias
@@ -22,7 +22,7 @@ from fieldcal import schemas
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import SchemaMismatch
 from fieldcal.schemas.arrow import VERSION_KEY
-from fieldcal.schemas.rows import IN_OLDER_ROWS
+from fieldcal.schemas.migrations import fillings, name_today
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import AroundRename, AtomicFile, write_bytes
 
@@ -179,12 +179,45 @@ def read_arrow(source: Path | bytes, table: str, *, stage: bool = False, name: s
     if isinstance(source, Path):
         with disk(source, "read"):
             source = source.read_bytes()
+    with _opened(source, shown) as file:
+        absent = schemas.check(file.schema_arrow, table, stage=stage)
+        rows = file.read(columns=[name for name in _names(table, stage) if name not in absent])
+        rows.validate(full=True)
+        return _completed(rows, absent, table, stage)
+
+
+def read_older(source: bytes, table: str, name: str) -> tuple[int, pa.Table]:
+    """Version of a file of the history, which is called `name` in messages, and its rows as today's version has them.
+
+    Columns have the names of today (`migrations.CHANGES`) and, where nothing is lost by it, the types.
+
+    Raises
+    ------
+    WarehouseError
+        `damaged_file`, `schema_mismatch`.
+    """
+    with _opened(source, name) as file:
+        known = schemas.TABLES[table].version
+        version = int((file.schema_arrow.metadata or {}).get(VERSION_KEY.encode(), known))
+        rows = file.read(use_threads=False)
+        rows.validate(full=True)
+        names = [name_today(table, version, column) for column in rows.column_names]
+        rows = rows.rename_columns(names).replace_schema_metadata(file.schema_arrow.metadata)
+        wanted = schemas.arrow_schema(table)
+        for i, field in enumerate(rows.schema):
+            if field.name in wanted.names and field.type != (kind := wanted.field(field.name).type):
+                with suppress(pa.ArrowException):  # what cannot be converted is refused below
+                    rows = rows.set_column(i, field.with_type(kind), rows.column(i).cast(kind))
+        absent = schemas.check(rows.schema, table)
+        return version, schemas.conform(_completed(rows, absent, table, stage=False), table)
+
+
+@contextmanager
+def _opened(source: bytes, shown: str) -> Iterator[pq.ParquetFile]:
+    """A Parquet file, each page checked as it is read; what goes wrong in the block as errors of the warehouse."""
     try:
         with pq.ParquetFile(pa.BufferReader(source), page_checksum_verification=True) as file:
-            absent = schemas.check(file.schema_arrow, table, stage=stage)
-            rows = file.read(columns=[name for name in _names(table, stage) if name not in absent])
-            rows.validate(full=True)
-            return _completed(rows, absent, table, stage)
+            yield file
     except SchemaMismatch as error:
         raise WarehouseError(ReasonCode.SCHEMA_MISMATCH, f"{shown}: {error}.") from error
     except (pa.ArrowException, pl.exceptions.PanicException, OSError, ValueError) as error:
@@ -255,8 +288,9 @@ def _arrow(data: Data) -> pa.Table:
 def _completed(rows: pa.Table, absent: Collection[str], table: str, stage: bool) -> pa.Table:
     """The rows with the columns that they lack (`schemas.check`), in the table's order."""
     schema = schemas.arrow_schema(table, stage=stage)
+    filled = fillings(table)
     for name in absent:
-        has = IN_OLDER_ROWS.get(name)
+        has = filled.get(name)
         kind = schema.field(name).type
         values = rows[has] if isinstance(has, str) else pa.repeat(pa.scalar(has, kind), rows.num_rows)
         rows = rows.append_column(schema.field(name), values)

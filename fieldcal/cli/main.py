@@ -247,6 +247,30 @@ def verify(
 
 
 @app.command
+def upgrade(*, dry_run: DryRun = False, as_json: AsJson = False, warehouse: Root = None, config: Config = None) -> int:
+    """Bring a history that an older fieldcal wrote to the form of today; rows and values stay.
+
+    May be interrupted and repeated. A file that cannot be upgraded is named and left as it is (exit code 3).
+    """
+    from fieldcal.cli.show import print_json
+    from fieldcal.warehouse.upgrade import upgrade as bring
+    from fieldcal.words.talk import say
+
+    result = bring(_root(warehouse), dry_run=dry_run)
+    if as_json:
+        print_json(result)
+        return OK if result["ok"] else LOSSES
+    for file in result["upgraded"]:
+        what = f"version {file['from_version']} to {file['to_version']}, {file['rows']} rows"
+        said = {"upgraded": what, "due": f"would go from {what}", "left": f"left as it is: {file['reason']}"}
+        print(printable(f"{file['table']} of {file['vehicle_id']}: {said[file['status']]}"))
+    left = sum(file["status"] == "left" for file in result["upgraded"])
+    done = "would be upgraded" if dry_run else "upgraded"
+    say(f"{result['files']} files: {len(result['upgraded']) - left} {done}, {left} left as they are")
+    return OK if result["ok"] else LOSSES
+
+
+@app.command
 def doctor(
     *,
     archive: Path | None = None,

@@ -148,7 +148,9 @@ def test_a_night_on_a_history_that_it_cannot_read_says_what_to_do(simulated: Pat
     content = content_sha256(warehouse)
     paths = history_files(warehouse, "flight")
     age(warehouse, paths[0], "flight", ["verdict"])
-    with pytest.raises(WarehouseError, match="Move this table's files away and run the night") as caught:
+    with pytest.raises(
+        WarehouseError, match="run `fieldcal upgrade`; move away a file that it leaves, and run the night"
+    ) as caught:
         run_night(simulated, warehouse, None, None, 1)
     assert caught.value.reason_code == "schema_mismatch"
     for path in paths:

@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-from typing import Any
-
-import polars as pl
 import pytest
-from polars.testing import assert_frame_equal
+from questions import PAGE, QUESTIONS, answered
 
 from fieldcal.flows.run import run_night
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse import Warehouse
-
-PAGE = (Path(__file__).parents[2] / "docs/how-to/ask-the-history.md").read_text(encoding="utf-8")
-QUESTION = re.compile(r"<!-- question -->\n\*\*(.+?)\*\*\n\n```sql\n(.+?)```\n\n```python\n(.+?)```", re.DOTALL)
-QUESTIONS = QUESTION.findall(PAGE)
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +40,4 @@ def test_there_are_five() -> None:
 
 @pytest.mark.parametrize(("question", "sql", "python"), QUESTIONS, ids=[question[0] for question in QUESTIONS])
 def test_sql_and_polars_answer_the_same(warehouse: Warehouse, question: str, sql: str, python: str) -> None:
-    names: dict[str, Any] = {"pl": pl, "w": warehouse}
-    exec(python, names)
-    answer = names["answer"]
-    assert answer.height
-    assert_frame_equal(warehouse.sql(sql), answer, check_dtypes=False, rel_tol=1e-9)
+    assert answered(warehouse, sql, python).height

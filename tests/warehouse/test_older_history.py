@@ -98,7 +98,12 @@ def test_a_column_that_is_no_longer_is_left_out(root: Path) -> None:
 @pytest.mark.parametrize(
     ("table", "change", "version", "told"),
     [
-        ("flight", lambda rows: rows.drop_columns(["verdict"]), -1, "missing verdict.* Move this table's files away"),
+        (
+            "flight",
+            lambda rows: rows.drop_columns(["verdict"]),
+            -1,
+            "missing verdict.* version 1, this release knows version 2.* run `fieldcal upgrade`",
+        ),
         ("flight", lambda rows: rows.drop_columns(["flight_id"]), -1, "missing flight_id"),
         (
             "flight",
@@ -118,7 +123,12 @@ def test_a_column_that_is_no_longer_is_left_out(root: Path) -> None:
             -1,
             "n_samples is double instead of int64",
         ),
-        ("flight", lambda rows: rows, 1, "A newer fieldcal wrote it: install that"),
+        (
+            "flight",
+            lambda rows: rows,
+            1,
+            "version 3, this release knows version 2.* A newer fieldcal wrote it: update fieldcal",
+        ),
     ],
 )
 def test_what_cannot_be_read_is_refused_with_what_to_do(

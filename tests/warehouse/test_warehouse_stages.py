@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -107,9 +108,26 @@ def test_records_are_plain_json(tmp_path: Path) -> None:
     assert stages.complete(*WHERE) is None
 
 
-def test_seal_finds_every_changed_byte() -> None:
-    data = seal({"a": [1, 2.5, "ü"], "b": None})
-    assert unseal(data) == {"a": [1, 2.5, "ü"], "b": None}
+SEALED_BY_THE_FIRST_NIGHTS = """{
+ "a": [
+  1
+ ],
+ "sealed_sha256": "%s",
+ "z": "ü"
+}
+"""
+
+
+@pytest.mark.parametrize("former", [False, True])
+def test_seal_finds_every_changed_byte(former: bool) -> None:
+    record = {"a": [1], "z": "ü"}
+    data = seal(record)
+    if former:
+        digest = hashlib.sha256(
+            SEALED_BY_THE_FIRST_NIGHTS.replace(' "sealed_sha256": "%s",\n', "").encode()
+        ).hexdigest()
+        data = (SEALED_BY_THE_FIRST_NIGHTS % digest).encode()
+    assert unseal(data) == record
     for position in range(len(data)):
         for bit in (1, 32, 128):
             changed = bytearray(data)

@@ -1,4 +1,4 @@
-"""DuckDB in a process of its own, which may be killed: `python sql_engine.py`. It imports nothing of fieldcal.
+"""DuckDB in a process of its own, which may be killed: `python engine.py`. It imports nothing of fieldcal.
 
 It reads questions, one JSON object a line, and answers each: a line of JSON (`error`: what kind and DuckDB's own words,
 or None), and without an error the result as an Arrow stream. The engine may open the files that a question names, for

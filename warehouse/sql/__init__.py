@@ -1,6 +1,6 @@
 """One SELECT over the history in DuckDB, locked down: no files, no network, no settings, bounded in memory and time.
 
-The engine works in a process of its own (`sql_engine`), which waits for further questions of this one. It keeps the
+The engine works in a process of its own (`engine`), which waits for further questions of this one. It keeps the
 limits as far as it counts; what it does not (plans of many thousand parts, single huge values) meets the end of its
 address space or, by the clock, of the process.
 """
@@ -25,7 +25,7 @@ import pyarrow as pa
 from fieldcal import schemas
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import HISTORY_TABLES
-from fieldcal.schemas.rows import IN_OLDER_ROWS
+from fieldcal.schemas.migrations import fillings
 from fieldcal.warehouse.checksums import assure
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.layout import history_files, vehicle_of
@@ -36,7 +36,7 @@ from fieldcal.warehouse.views import view_text
 VIEWS = ("latest_calibration", "history", "drift_by_temperature", "worst_tic", "refusals", "active", "calibration_at")
 
 _ABOUT_ALL = ("show", "describe", "summarize", "information_schema", "duckdb_", "pg_", "pragma_")
-_ENGINE = Path(__file__).with_name("sql_engine.py")
+_ENGINE = Path(__file__).with_name("engine.py")
 _EPOCH_DAY = date(1970, 1, 1).toordinal()
 _GRACE_S = 1.0
 """Time for the engine to stop by itself."""
@@ -152,7 +152,7 @@ def _select(table: str, paths: Sequence[Path], absent: Collection[str]) -> str:
 
 def _younger(table: str, name: str) -> str:
     """What rows of an older version have in a column that they lack (`schemas.check`)."""
-    has = IN_OLDER_ROWS.get(name)
+    has = fillings(table).get(name)
     if isinstance(has, str):
         return f'f."{has}" AS "{name}"'
     value = "NULL" if has is None else str(has)
@@ -184,7 +184,7 @@ class _Failed:
 
 
 class _Engine:
-    """A process of `sql_engine`."""
+    """A process of `engine`."""
 
     def __init__(self) -> None:
         self.owner = os.getpid()
