@@ -1,15 +1,20 @@
 """Asking a history of 100,000 flights: one vehicle's drift, the whole fleet's latest calibration, in SQL and polars.
 
-    python benchmarks/bench_history.py [--flights 100000] [--vehicles 500] [--root FOLDER]
+    python benchmarks/bench_history.py [--flights 100000] [--vehicles 500] [--root FOLDER] [--check]
 
 The history is generated (36 calibration rows a flight, seeded) and written through the warehouse's own code. Best of
-five, a new connection for every SQL query.
+five, a new connection for every SQL query. `--check` measures instead what it costs that every byte is held against its
+recorded sha256 first: the whole fleet's calibration with and without, from the disk and from the page cache, in a new
+process and in one that has read before.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -141,12 +146,54 @@ def best(question: Callable[[], pl.DataFrame], rounds: int = 5) -> tuple[float, 
     return min(times), answer
 
 
+WHOLE_SCAN = """
+import sys, time
+from fieldcal.warehouse import Warehouse, query
+if sys.argv[2] == "unchecked":
+    query.assure = lambda root, files: None
+for _ in range(2):
+    began = time.perf_counter()
+    Warehouse(sys.argv[1]).scan("calibration").collect()
+    print(time.perf_counter() - began)
+"""
+"""Seconds of the first scan of a process, and of the second."""
+
+
+def cost_of_check(root: Path, rounds: int = 7) -> None:
+    """Medians, the two forms taking turns."""
+    files = [path for part in ("tables", "checksums") for path in (root / part).rglob("*") if path.is_file()]
+    os.sync()
+    for cold in (True, False):
+        times: dict[str, list[list[float]]] = {"checked": [], "unchecked": []}
+        for _ in range(rounds):
+            for form, found in times.items():
+                if cold:
+                    _forget(files)
+                program = [sys.executable, "-c", WHOLE_SCAN, str(root), form]
+                told = subprocess.run(program, check=True, capture_output=True, text=True).stdout
+                found.append([float(line) for line in told.split()])
+        for number, which in enumerate(("first", "second")):
+            checked, unchecked = (float(np.median([each[number] for each in times[form]])) for form in times)
+            where = "files on disk" if cold and not number else "files in the page cache"
+            share = 100.0 * (checked - unchecked) / unchecked
+            scan = f"{which} scan of a process, {where}"
+            print(f"{scan}: {checked * 1e3:.0f} ms, unchecked {unchecked * 1e3:.0f} ms, {share:+.0f} %")
+
+
+def _forget(files: list[Path]) -> None:
+    """Take files out of the page cache."""
+    for path in files:
+        with path.open("rb") as file:
+            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
 def main() -> None:
     """Generate and ask."""
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("--flights", type=int, default=100_000)
     arguments.add_argument("--vehicles", type=int, default=500)
     arguments.add_argument("--root", type=Path)
+    arguments.add_argument("--check", action="store_true")
     given = arguments.parse_args()
     root = given.root or Path(tempfile.mkdtemp(prefix="fieldcal-history-"))
     if not (root / "tables").is_dir():
@@ -154,7 +201,16 @@ def main() -> None:
     size = sum(path.stat().st_size for path in (root / "tables").rglob("*.parquet"))
     rows = Warehouse(root).scan("calibration").select(pl.len()).collect().item()
     print(f"{given.flights} flights, {given.vehicles} vehicles, {rows / 1e6:.1f} million rows, {size / 1e6:.0f} MB")
-    warehouse = Warehouse(root)
+    if given.check:
+        cost_of_check(root)
+    else:
+        ask(Warehouse(root))
+    if given.root is None:
+        shutil.rmtree(root)
+
+
+def ask(warehouse: Warehouse) -> None:
+    """Time the questions."""
     questions: dict[str, Callable[[], pl.DataFrame]] = {
         "drift of one vehicle, polars": lambda: drift_polars(warehouse),
         "drift of one vehicle, SQL": lambda: warehouse.sql(DRIFT_SQL),
@@ -167,8 +223,6 @@ def main() -> None:
         print(f"{name}: {seconds * 1e3:.0f} ms, {answers[name].height} rows")
     polars, sql = (answers[f"drift of one vehicle, {engine}"] for engine in ("polars", "SQL"))
     assert np.allclose(polars["slope_per_degc"], sql["slope_per_degc"]), "both engines must say the same"
-    if given.root is None:
-        shutil.rmtree(root)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""Processes end in time: a worker with the process that started it, and none waits for a server that is gone.
+"""Processes end in time: a worker with the process that started it, `serve` with its server, and none waits for one
+that is gone.
 
 Prefect tells its server of every task from a queue, and at exit waits until all has been told: for ever, if nobody
 listens any more. Its records are worth an attempt, not a night.
@@ -9,9 +10,14 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
+import time
+from collections.abc import Callable
+
+from fieldcal.words.talk import say
 
 ATTEMPTS = 3
 """Before each one more than these Prefect waits for a second."""
+LOOK_EVERY_S = 2.0
 
 
 def end_with_parent() -> None:
@@ -22,6 +28,21 @@ def end_with_parent() -> None:
 
     def wait() -> None:
         parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def end_with_server(lives: Callable[[], bool], sentence: str) -> None:
+    """End this process with exit code 1 and a sentence when the server that it hosts schedules for is gone.
+
+    At once: what would be said goodbye to is the server. The runs it had started end with it (`end_with_parent`).
+    """
+
+    def wait() -> None:
+        while lives():
+            time.sleep(LOOK_EVERY_S)
+        say(f"fieldcal: {sentence}")
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()

@@ -135,6 +135,10 @@ class Server:
         """Folder of the server's files."""
         return self._home
 
+    def lives(self) -> bool:
+        """Whether it does, as far as the lock tells that a server of ours holds until it ends."""
+        return not self.own or is_held(self._home / LIVES)
+
     def start(self) -> None:
         """Take the server that runs, or begin to start one; Prefect, once imported, finds it in the environment."""
         if self.own:

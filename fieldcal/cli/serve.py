@@ -58,6 +58,7 @@ def serve(
     os.environ.setdefault("PREFECT_RUNNER_POLL_FREQUENCY", "2")
     with running_server(root, serving=True) as server:
         from fieldcal.flows.deploy import host, local_timezone, register
+        from fieldcal.flows.farewell import end_with_server
         from fieldcal.flows.housekeeping import keep_tidy, tidy_prefect
         from fieldcal.flows.served import Served
 
@@ -72,6 +73,7 @@ def serve(
         say("Sessions: fieldcal trigger SESSION_DIR" + (f", and by themselves in {watch}" if watch else ""))
         if server.own:
             keep_tidy(root, url)
+            end_with_server(server.lives, _lost(server.home))
             say(f"The server's secret, for those who emit events or open its pages: {server.home / SECRET_FILE}")
         host(runner, url, watch.absolute() if watch else None, quiet)
     return 0
@@ -110,6 +112,13 @@ def trigger(
         known = "is scheduled" if asked["created"] else f"was asked for before; it is {asked['state'].lower()}"
         print(f"{folder}: flow run {asked['name']} {known}")
     return 0
+
+
+def _lost(home: Path) -> str:
+    return (
+        f"The Prefect server ended ({home / 'server.log'} may say why), so that no run would start any more; serve "
+        "ends too. Start it again: what is done is kept, and the next night goes on from there."
+    )
 
 
 def _last_line(error: Exception) -> str:

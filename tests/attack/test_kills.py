@@ -56,9 +56,14 @@ def workers(process: subprocess.Popen[str]) -> list[int]:
     return [child for child, line in lines.items() if line.exists() and b"spawn_main" in line.read_bytes()]
 
 
-def server(root: Path) -> int:
-    record: int = json.loads((root / "prefect" / "server.json").read_text())["pid"]
+def server(root: Path, home: str = "prefect") -> int:
+    record: int = json.loads((root / home / "server.json").read_text())["pid"]
     return record
+
+
+def descendants(pid: int) -> list[int]:
+    children = [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    return [*children, *(below for child in children for below in descendants(child))]
 
 
 def lives(pid: int) -> bool:
@@ -115,3 +120,48 @@ def test_a_killed_night_leaves_nobody_behind(archive: Path, tmp_path: Path) -> N
     while any(lives(pid) for pid in left):
         assert time.monotonic() < give_up, [pid for pid in left if lives(pid)]
         time.sleep(0.05)
+
+
+@outside_ci
+def test_serve_ends_with_its_server_and_leaves_nobody_behind(archive: Path, tmp_path: Path) -> None:
+    """The server is killed while a session runs: a sentence, exit code 1, and the session is run again by a night."""
+    command = [sys.executable, "-m", "fieldcal"]
+    process = subprocess.Popen(
+        [*command, "serve", str(archive), "--warehouse", str(tmp_path)],
+        cwd=REPOSITORY,
+        env=CLEAN,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    told = [process.stderr.readline() for _ in range(3)]
+    assert "Serving at" in told[0]
+    (session, *_) = (archive / "sim-1").iterdir()
+    asked = [*command, "trigger", str(session), "--warehouse", str(tmp_path)]
+    subprocess.run(asked, cwd=REPOSITORY, env=CLEAN, check=True, timeout=PATIENCE_S)
+    wait_for(process, lambda: some_stage(tmp_path))
+    left = descendants(process.pid)
+    os.kill(server(tmp_path, "prefect/serve"), signal.SIGKILL)
+    killed = time.monotonic()
+    _, talk = process.communicate(timeout=PATIENCE_S)
+    assert time.monotonic() - killed < 2 * GONE_WITHIN_S
+    assert process.returncode == 1
+    assert "fieldcal: The Prefect server ended (" in talk
+    assert "Traceback" not in talk
+    while any(lives(pid) for pid in left):
+        assert time.monotonic() - killed < 3 * GONE_WITHIN_S, [pid for pid in left if lives(pid)]
+        time.sleep(0.05)
+    assert night(archive, tmp_path).wait(PATIENCE_S) == 0
+    assert verify(tmp_path)["ok"]
+
+
+def test_who_hosts_for_a_server_that_is_gone_ends() -> None:
+    program = """
+import time
+from fieldcal.flows.farewell import end_with_server
+answers = iter([True, False])
+end_with_server(lambda: next(answers), "It is gone.")
+time.sleep(60)
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
+    assert (ended.returncode, ended.stderr) == (1, "fieldcal: It is gone.\n")
