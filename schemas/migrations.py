@@ -15,8 +15,8 @@ class Change:
     """What one version of a table changed.
 
     Columns that were added are filled by whoever reads an older file. One that was renamed cannot be read: `fieldcal
-    upgrade` brings the file up to date, and converts types where nothing is lost. A column that was dropped needs no
-    line here.
+    upgrade` brings the file up to date, and converts types where nothing is lost. None was ever dropped: readers pass
+    over such a column, and an upgrade leaves the file.
 
     Parameters
     ----------

@@ -209,6 +209,8 @@ def read_older(source: bytes, table: str, name: str) -> tuple[int, pa.Table]:
                 with suppress(pa.ArrowException):  # what cannot be converted is refused below
                     rows = rows.set_column(i, field.with_type(kind), rows.column(i).cast(kind))
         absent = schemas.check(rows.schema, table)
+        if lost := set(names) - set(wanted.names):
+            raise SchemaMismatch(f"an upgrade of {table} would lose what the columns {', '.join(sorted(lost))} hold")
         return version, schemas.conform(_completed(rows, absent, table, stage=False), table)
 
 

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 from history_rows import flight
 from older_history import age, rewrite
+from outside_ci import outside_ci
 from questions import QUESTIONS, answered
 
 from fieldcal.batch.closing import close_night
@@ -32,6 +33,7 @@ from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.layout import history_files, history_path
 from fieldcal.warehouse.publish import publish, read_history
+from fieldcal.warehouse.store import empty_frame
 from fieldcal.warehouse.upgrade import upgrade
 from fieldcal.warehouse.verify import verify
 
@@ -250,6 +252,37 @@ def test_a_column_that_was_renamed_and_a_type_that_was_widened(root: Path, monke
     row = Warehouse(root).scan("flight", vehicle_id="a").collect()
     assert row["n_samples"].to_list() == [7]
     assert "length_s" not in row.columns
+
+
+def test_a_column_that_is_no_longer_is_not_lost(root: Path) -> None:
+    path = history_path(root, "flight", "a")
+    rows = pq.read_table(path, partitioning=None).append_column("former", pa.array([1.0]))
+    rewrite(root, path, rows, TABLES["flight"].version - 1)
+    before = path.read_bytes()
+    (told,) = upgrade(root)["upgraded"]
+    assert (told["status"], path.read_bytes()) == ("left", before)
+    assert "would lose what the columns former hold" in str(told["reason"])
+
+
+@pytest.mark.parametrize(
+    "command", ["history", "drift", "export a", "verify", "report", "sql", pytest.param("nightly", marks=outside_ci)]
+)
+def test_whoever_meets_a_newer_version_says_so(
+    command: str, root: Path, tmp_path_factory: pytest.TempPathFactory, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for table in ("flight", "calibration", "run"):
+        path = history_path(root, table, "a")
+        rewrite(root, path, pq.read_table(path, partitioning=None), 9)
+    rewrite(root, history_path(root, "drift", "a"), empty_frame("drift").to_arrow(), 9)
+    archive = tmp_path_factory.mktemp("archive")
+    more = {"sql": ["FROM calibration"], "nightly": [str(archive)]}.get(command, [])
+    if command == "nightly":
+        write_flights(archive, Experiment(seed=5, duration_s=20.0, sets=1))
+        (archive / "sim-1").rename(archive / "a")
+    assert run([*command.split(), *more, "--warehouse", str(root)]) == 1
+    told = capsys.readouterr().err
+    assert "schema version 9, this release knows version" in told
+    assert "A newer fieldcal wrote it: update fieldcal" in told
 
 
 def test_every_version_since_the_first_is_declared() -> None:
