@@ -29,6 +29,8 @@ from fieldcal.warehouse.files import AroundRename, AtomicFile, write_bytes
 Data: TypeAlias = pl.DataFrame | pa.Table | pa.RecordBatch | Mapping[str, np.ndarray]
 
 _ROWS_PER_GROUP = 131_072
+_THREADS_FROM_BYTES = 4 << 20
+"""Below, threads gain nothing, and a process that ends just after pyarrow started them may be aborted."""
 
 
 class TableWriter:
@@ -181,7 +183,8 @@ def read_arrow(source: Path | bytes, table: str, *, stage: bool = False, name: s
             source = source.read_bytes()
     with _opened(source, shown) as file:
         absent = schemas.check(file.schema_arrow, table, stage=stage)
-        rows = file.read(columns=[name for name in _names(table, stage) if name not in absent])
+        names = [name for name in _names(table, stage) if name not in absent]
+        rows = file.read(columns=names, use_threads=len(source) >= _THREADS_FROM_BYTES)
         rows.validate(full=True)
         return _completed(rows, absent, table, stage)
 
@@ -199,7 +202,7 @@ def read_older(source: bytes, table: str, name: str) -> tuple[int, pa.Table]:
     with _opened(source, name) as file:
         known = schemas.TABLES[table].version
         version = int((file.schema_arrow.metadata or {}).get(VERSION_KEY.encode(), known))
-        rows = file.read(use_threads=False)
+        rows = file.read(use_threads=len(source) >= _THREADS_FROM_BYTES)
         rows.validate(full=True)
         names = [name_today(table, version, column) for column in rows.column_names]
         rows = rows.rename_columns(names).replace_schema_metadata(file.schema_arrow.metadata)

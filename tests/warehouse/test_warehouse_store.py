@@ -222,3 +222,20 @@ def test_files_and_folders_are_forced_to_disk_before_they_count(
     write_bytes(tmp_path / "new" / "data", b"x", durable=durable)
     parent = f"fsync {tmp_path.name}"
     assert done == ([parent, "fsync tmp", "rename", "fsync new"] if durable else ["rename"])
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="counts threads")
+def test_a_small_table_is_read_without_threads(tmp_path: Path) -> None:
+    """Some processes that ended just after such a read were aborted: exit code 134 behind a good answer."""
+    path = tmp_path / "part.parquet"
+    store.write_table(store.empty_frame("flight"), "flight", path)
+    program = """
+import os, sys
+from pathlib import Path
+from fieldcal.warehouse.store import read_arrow
+before = set(os.listdir("/proc/self/task"))
+read_arrow(Path(sys.argv[1]), "flight")
+print(len(set(os.listdir("/proc/self/task")) - before))
+"""
+    told = subprocess.run([sys.executable, "-c", program, str(path)], check=True, capture_output=True, text=True)
+    assert told.stdout == "0\n"
