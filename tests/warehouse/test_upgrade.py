@@ -220,18 +220,27 @@ def test_what_cannot_be_upgraded_is_named_and_left(root: Path, capsys: pytest.Ca
 
 
 @pytest.mark.parametrize("change", CHANGES, ids=lambda change: f"{change.table}-{change.version}")
-def test_a_file_from_before_each_change_is_filled(change: Change, root: Path) -> None:
-    if change.table not in ("flight", "calibration", "run"):
-        rows = TABLES[change.table].columns
-        assert set(change.added) <= {column.name for column in rows}
-        return
-    path = history_path(root, change.table, "a")
-    now = read_history(root, change.table, "a")
-    age(root, path, change.table, [name for name in change.added if name in now.columns])
+def test_a_file_from_before_each_change_is_filled(change: Change, tmp_path: Path) -> None:
+    """Without the columns that this change and those after it added."""
+    root = older("5af0435", tmp_path)
     upgrade(root)
-    filled = {name: pl.col(has) if isinstance(has, str) else pl.lit(has) for name, has in change.added.items()}
+    path = history_path(root, change.table, "sim-1")
+    now = read_history(root, change.table, "sim-1")
+    young = {
+        name: has
+        for other in CHANGES
+        if other.table == change.table and other.version >= change.version
+        for name, has in other.added.items()
+    }
+    rewrite(root, path, pq.read_table(path, partitioning=None).drop_columns(list(young)), change.version - 1)
+    read = {table: Warehouse(root).scan(table).collect() for table in HISTORY_TABLES}
+    (told,) = upgrade(root)["upgraded"]
+    assert (told["status"], told["from_version"], told["rows"]) == ("upgraded", change.version - 1, now.height)
+    filled = {name: pl.col(has) if isinstance(has, str) else pl.lit(has) for name, has in young.items()}
     expected = now.with_columns(value.cast(now.schema[name]).alias(name) for name, value in filled.items())
-    polars.testing.assert_frame_equal(pl.read_parquet(path), expected)
+    polars.testing.assert_frame_equal(pl.read_parquet(path, hive_partitioning=False), expected)
+    polars.testing.assert_frame_equal(read[change.table], expected)
+    assert verify(root)["ok"]
 
 
 def test_a_column_that_was_renamed_and_a_type_that_was_widened(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
