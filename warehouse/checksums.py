@@ -67,11 +67,11 @@ def problem(root: Path, path: Path, sha256: str | None) -> str | None:
     return "it is missing" if sha256 is None else "its content is not what was written: the sha256 differs"
 
 
-def assure(root: Path, paths: Iterable[Path]) -> None:
+def assure(root: Path, paths: Iterable[Path], *, strict: bool = False) -> None:
     """Make sure, before files are read, that each holds what was written: every byte, by its recorded sha256.
 
-    Where none is recorded, or the record itself is damaged, the file has only the checksums of its pages. One that is
-    absent holds nothing wrong: `verify` tells that it is missing.
+    Where none is recorded, or the record itself is damaged, the file has only the checksums of its pages: `strict`
+    refuses that too. One that is absent holds nothing wrong: `verify` tells that it is missing.
 
     Raises
     ------
@@ -79,23 +79,28 @@ def assure(root: Path, paths: Iterable[Path]) -> None:
         `damaged_file`, or the disk's refusal.
     """
     for path in paths:
-        if not any(_as_recorded(root, path) for _ in range(_TRIES)):
+        for _ in range(_TRIES):
+            wrong = _wrong(root, path, strict)
+            if wrong is None:
+                break
+        else:
             raise WarehouseError(
                 ReasonCode.DAMAGED_FILE,
-                f"{path} is damaged (its content is not what was written: the sha256 differs); `fieldcal verify` lists "
-                f"what else is. Restore it, or remove it and {checksum_path(root, path)} and run the night again: the "
-                "flights are calibrated anew.",
+                f"{path} is damaged ({wrong}); `fieldcal verify` lists what else is. Restore it, or remove it and "
+                f"{checksum_path(root, path)} and run the night again: the flights are calibrated anew.",
             )
 
 
-def _as_recorded(root: Path, path: Path) -> bool:
+def _wrong(root: Path, path: Path, strict: bool) -> str | None:
     if not path.exists():
-        return True
-    try:
-        allowed = recorded(root, path)
-    except BrokenSeal:
-        return True
-    return allowed is None or file_sha256(path) in allowed
+        return None
+    if not strict:
+        try:
+            if recorded(root, path) is None:
+                return None
+        except BrokenSeal:
+            return None
+    return problem(root, path, file_sha256(path))
 
 
 def history_digest(root: Path, tables: Iterable[str]) -> str:

@@ -68,7 +68,7 @@ def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path],
         raise WarehouseError(
             ReasonCode.NO_WAREHOUSE, f"There is no warehouse at {root}; run `fieldcal nightly` or give --warehouse."
         )
-    found = [*_recorded_files(root), *_stage_files(root), *_night_files(root)]
+    found = [*_recorded_files(root), *_stage_files(root), *night_files(root)]
     if archive is not None:
         if log_sha256 is None:
             raise ValueError("log_sha256 is needed to check an archive")
@@ -115,7 +115,7 @@ def _stage_files(root: Path) -> Iterator[Problem]:
             yield str(file.relative_to(root)), broken.get(file)
 
 
-def _night_files(root: Path) -> Iterator[Problem]:
+def night_files(root: Path) -> Iterator[Problem]:
     """What the last night remembers for the next, each file with its own digest."""
     for path in sorted((root / "night").rglob("*.json")):
         try:

@@ -11,11 +11,11 @@ from fieldcal.batch.sources import TRENDS, sources
 from fieldcal.config.configuration import Alerts
 from fieldcal.names import Json
 from fieldcal.provenance.run_key import run_key
-from fieldcal.schemas import FLIGHT_TABLES, TABLES
+from fieldcal.schemas import FLIGHT_TABLES, HISTORY_TABLES, TABLES
 from fieldcal.schemas.arrow import VERSION_KEY
 from fieldcal.trends.changes import Change, changes, last_usable
 from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.checksums import history_digest
+from fieldcal.warehouse.checksums import assure, history_digest
 from fieldcal.warehouse.decisions.withdrawn import decisions
 from fieldcal.warehouse.errors import disk
 from fieldcal.warehouse.files import write_bytes
@@ -24,6 +24,7 @@ from fieldcal.warehouse.lock import fleet_lock
 from fieldcal.warehouse.publish import settle
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 from fieldcal.warehouse.store import read_facts
+from fieldcal.warehouse.verify import night_files
 
 INPUTS = (*FLIGHT_TABLES, "decision")
 MOST_PAGES = 10
@@ -43,13 +44,17 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
     Trends are regressed only where the history, or the code that makes them, is another than last time. Reports: the
     fleet's page, and the pages of vehicles of which something is told; `fieldcal report` makes any other.
 
+    The history is held against its records first, so that no night ends well over damage that it had no need to read.
+
     Raises
     ------
     WarehouseError
-        As `fieldcal.trends.drift_table.update_drift`; `busy`.
+        As `fieldcal.trends.drift_table.update_drift`; `damaged_file`, `busy`.
     """
     now = datetime.now(UTC)
     with fleet_lock(root):
+        assure(root, [path for table in HISTORY_TABLES for path in history_files(root, table)], strict=True)
+        _forget_damaged(root)
         before = _remembered(root)
         _forget_other_versions(root)
         for vehicle_id in decisions(root)["vehicle_id"].unique().sort().to_list():
@@ -77,6 +82,14 @@ def _reports(root: Path, told: Sequence[Change]) -> Path:
 
     vehicles = list(dict.fromkeys(change.vehicle_id for change in told if change.kind not in ("expired", "idle")))
     return write_night_reports(root, vehicles[:MOST_PAGES])[0]
+
+
+def _forget_damaged(root: Path) -> None:
+    """Remove what nights remember where it is damaged: it is made anew."""
+    for shown, wrong in night_files(root):
+        if wrong is not None:
+            with disk(root / shown, "removed"):
+                (root / shown).unlink(missing_ok=True)
 
 
 def _forget_other_versions(root: Path) -> None:

@@ -36,6 +36,7 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.pipeline import INGEST, PIPELINE
 from fieldcal.stages.results import StageResult, plain
 from fieldcal.stages.stage import Stage, run_stage, stage_and_unit, step_of
+from fieldcal.warehouse.checksums import problem
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.files import file_sha256
 from fieldcal.warehouse.layout import signal_path
@@ -255,8 +256,12 @@ class FlightWork:
         return self._kept(INGEST, key, {}, record) if keep else _unkept(record, key)
 
     def _signals_whole(self, record: Record) -> bool:
-        paths = {t: signal_path(self._root, t, self.job.vehicle_id, self.job.flight_id) for t in record["signals"]}
-        return all(p.exists() and file_sha256(p) == record["signals"][t]["sha256"] for t, p in paths.items())
+        return all(self._whole(table, written["sha256"]) for table, written in record["signals"].items())
+
+    def _whole(self, table: str, sha256: str) -> bool:
+        """Whether readings are what ingest wrote, and what everybody else holds them against says so too."""
+        path = signal_path(self._root, table, self.job.vehicle_id, self.job.flight_id)
+        return path.exists() and file_sha256(path) == sha256 and problem(self._root, path, sha256) is None
 
     # --- stages
 

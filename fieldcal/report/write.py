@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection
 from datetime import datetime
 from functools import partial
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from fieldcal.report.links import FLEET, Links, flight_name, vehicle_name
 from fieldcal.report.page import Page, html
-from fieldcal.warehouse.checksums import recording
+from fieldcal.warehouse.checksums import problem, recording
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import prepare
 
@@ -122,10 +123,12 @@ def _place(root: Path, name: str) -> Path:
 
 def _write(path: Path, page: Page) -> Path:
     data = html(page).encode("utf-8")
-    recorded = None
+    recorded, wrong = None, None
     if path.parent.name == FOLDER:
-        prepare(path.parent.parent)
-        recorded = partial(recording, path.parent.parent, path, dispensable=True)
-    if not path.is_file() or path.read_bytes() != data:
+        root = path.parent.parent
+        prepare(root)
+        recorded = partial(recording, root, path, dispensable=True)
+        wrong = problem(root, path, hashlib.sha256(data).hexdigest())
+    if wrong is not None or not path.is_file() or path.read_bytes() != data:
         write_bytes(path, data, recorded)
     return path
