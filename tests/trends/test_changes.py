@@ -10,10 +10,10 @@ import polars as pl
 import pyarrow.parquet as pq
 from drift_history import publish_fleet
 from history_rows import START, rows
+from older_history import rewrite
 
 from fieldcal.batch.closing import close_night
 from fieldcal.config.configuration import Alerts
-from fieldcal.schemas.arrow import VERSION_KEY
 from fieldcal.trends.changes import changes, last_usable
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.layout import history_files
@@ -94,9 +94,7 @@ def test_trends_of_another_release_are_made_anew(tmp_path: Path) -> None:
     close_night(tmp_path, Alerts(expires_days=1e5, idle_days=1e5))
     made = Warehouse(tmp_path).scan("drift").collect()
     (path, *_) = history_files(tmp_path, "drift")
-    table = pq.read_table(path)
-    other = {**(table.schema.metadata or {}), VERSION_KEY.encode(): b"2"}
-    pq.write_table(table.drop_columns(["best_known_at"]).replace_schema_metadata(other), path)
+    rewrite(tmp_path, path, pq.read_table(path, partitioning=None).drop_columns(["best_known_at"]), 2)
     close_night(tmp_path, Alerts(expires_days=1e5, idle_days=1e5))
     assert Warehouse(tmp_path).scan("drift").collect().equals(made)
 
