@@ -1,7 +1,8 @@
 """Parquet: the only place that writes or reads it.
 
 Every file carries its table's schema (unit and meaning of every column) and a checksum for every page; reading verifies
-both. Floats are dictionary-encoded, time stamps delta-encoded, pages compressed with zstd. Equal data give equal bytes.
+both. Time stamps are delta-encoded, texts by dictionary, readings and what stages make of them by byte-stream split (the
+history's numbers, of which many are alike, by dictionary); pages are compressed with zstd. Equal data give equal bytes.
 """
 
 from __future__ import annotations
@@ -78,7 +79,8 @@ class TableWriter:
         self._schema = schemas.arrow_schema(table, stage=stage, units=units, metadata=metadata)
         self._file = AtomicFile(path, around_rename, durable=durable)
         try:
-            self._parquet = pq.ParquetWriter(self._file, self._schema, **_options(self._schema))
+            readings = stage or schemas.TABLES[schemas.signal_kind(table)].kind != "history"
+            self._parquet = pq.ParquetWriter(self._file, self._schema, **_options(self._schema, readings=readings))
         except BaseException:
             self._file.close()
             raise
@@ -306,14 +308,16 @@ def _names(table: str, stage: bool) -> tuple[str, ...]:
     return tuple(column.name for column in schemas.table_columns(table, stage=stage))
 
 
-def _options(schema: pa.Schema) -> dict[str, object]:
+def _options(schema: pa.Schema, *, readings: bool = False) -> dict[str, object]:
+    """How a table is written; `readings`: a signal's or a stage's, in which hardly a number is like another."""
     stamps = [field.name for field in schema if field.name.endswith("_ns")]
+    split = [field.name for field in schema if readings and pa.types.is_floating(field.type)]
     return {
         "version": "2.6",
         "compression": "zstd",
-        "compression_level": 3,
-        "use_dictionary": [field.name for field in schema if field.name not in stamps],
-        "column_encoding": dict.fromkeys(stamps, "DELTA_BINARY_PACKED"),
+        "compression_level": 1 if readings else 3,
+        "use_dictionary": [field.name for field in schema if field.name not in (*stamps, *split)],
+        "column_encoding": dict.fromkeys(stamps, "DELTA_BINARY_PACKED") | dict.fromkeys(split, "BYTE_STREAM_SPLIT"),
         "write_page_checksum": True,
         "write_statistics": True,
         "dictionary_pagesize_limit": 4 << 20,
