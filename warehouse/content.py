@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 
 from fieldcal import schemas
 from fieldcal.warehouse.layout import history_files
+from fieldcal.warehouse.rows_as_json import column_bytes
 from fieldcal.warehouse.store import read_table
 
 _JSON_COLUMNS = ("measured", "findings")
@@ -48,21 +47,9 @@ def rows_sha256(rows: pl.DataFrame, table: str) -> bytes:
     digest = hashlib.sha256()
     for name in columns:
         digest.update(name.encode())
-        for part in _parts(ordered[name]):
+        for part in column_bytes(ordered[name]):
             digest.update(part)
     return digest.digest()
-
-
-def _parts(column: pl.Series) -> Iterator[bytes]:
-    yield column.is_null().to_numpy().tobytes()
-    if column.dtype == pl.String:
-        texts = [text.encode() for text in column.fill_null("")]
-        yield np.array([len(text) for text in texts], dtype="<i8").tobytes()
-        yield b"".join(texts)
-    elif column.dtype == pl.Float64:
-        yield column.fill_null(0.0).to_numpy().astype("<f8").tobytes()
-    else:
-        yield column.cast(pl.Int64).fill_null(0).to_numpy().astype("<i8").tobytes()
 
 
 def _canonical_json(text: str) -> str:

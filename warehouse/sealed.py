@@ -27,7 +27,8 @@ def seal(record: Mapping[str, object]) -> bytes:
     body = {key: value for key, value in record.items() if key != _SEAL}
     if not body:
         raise ValueError("an empty record has nothing to seal")
-    text = _text(body)
+    inner = json.dumps(body, sort_keys=True, allow_nan=False, ensure_ascii=False, separators=(",", ":"))[1:-1]
+    text = f"{{\n{inner}".encode() + _END
     return text.removesuffix(_END) + _last_line(text)
 
 

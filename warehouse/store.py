@@ -1,8 +1,9 @@
 """Parquet: the only place that writes or reads it.
 
 Every file carries its table's schema (unit and meaning of every column) and a checksum for every page; reading verifies
-both. Time stamps are delta-encoded, texts by dictionary, readings and what stages make of them by byte-stream split (the
-history's numbers, of which many are alike, by dictionary); pages are compressed with zstd. Equal data give equal bytes.
+both. Time stamps are delta-encoded, texts by dictionary, readings and what stages make of them by byte-stream split
+(the numbers of the history, of which many are alike, by dictionary); pages are compressed with zstd. Equal data give
+equal bytes.
 """
 
 from __future__ import annotations
@@ -277,9 +278,9 @@ def frame(rows: pa.Table) -> pl.DataFrame:
     return result
 
 
-def conform(data: Data, table: str) -> pa.Table:
+def conform(data: Data, table: str, *, stage: bool = False) -> pa.Table:
     """`schemas.conform` of any form of data."""
-    return schemas.conform(_arrow(data), table)
+    return schemas.conform(_arrow(data), table, stage=stage)
 
 
 def _arrow(data: Data) -> pa.Table:

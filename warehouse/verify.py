@@ -111,8 +111,9 @@ def _stage_files(root: Path) -> Iterator[Problem]:
         yield shown, None
         broken = dict(broken_outputs(path.parent, record))
         for output in outputs_of(record).values():
-            file = path.parent / output["file"]
-            yield str(file.relative_to(root)), broken.get(file)
+            if "file" in output:
+                file = path.parent / output["file"]
+                yield str(file.relative_to(root)), broken.get(file)
 
 
 def night_files(root: Path) -> Iterator[Problem]:

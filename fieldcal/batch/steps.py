@@ -24,6 +24,7 @@ from fieldcal.config.stage_settings import as_json, taken_from
 from fieldcal.errors import UnreadableLog, unforeseen
 from fieldcal.flight.job import Job, file_stamp
 from fieldcal.flight.record import Causes, Output, Record
+from fieldcal.flight.stage_tables import STAGES, StageTables
 from fieldcal.flight.units import units_of
 from fieldcal.flight.versions import versions
 from fieldcal.logs import ingest
@@ -40,13 +41,12 @@ from fieldcal.warehouse.checksums import problem
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.files import file_sha256
 from fieldcal.warehouse.layout import signal_path
-from fieldcal.warehouse.signals import read_signal, signal_writer
-from fieldcal.warehouse.stage_store import StageStore
+from fieldcal.warehouse.signals import signal_writer
+from fieldcal.warehouse.stage_store import StageStore, outputs_of
 from fieldcal.warehouse.store import TableWriter
 
 STEPS = (INGEST, *(stage.name for stage in PIPELINE))
 """Of the primary unit."""
-STAGES: dict[str, Stage] = {stage.name: stage for stage in PIPELINE}
 
 
 class FlightWork:
@@ -84,7 +84,7 @@ class FlightWork:
         self._vehicle = vehicle
         self._settings: FlightSettings | None = None
         self._inputs: dict[str, str] = {}
-        self._tables: dict[str, pl.DataFrame] = {}
+        self._tables = StageTables(root, job.vehicle_id, job.flight_id, self.records, table)
 
     def usable(self) -> bool:
         """Whether ingest left anything to calibrate on; known once its record is."""
@@ -268,7 +268,7 @@ class FlightWork:
     def _stage(self, step: str) -> Record:
         stage, key = _stage_of(step), self.key(step)
         try:
-            tables = {name: self._table(name) for name in set(stage.reads.values()) if name in self._inputs}
+            tables = {name: self._tables[name] for name in set(stage.reads.values()) if name in self._inputs}
             result = run_stage(stage, tables, self._known())
         except WarehouseError:
             raise
@@ -279,23 +279,12 @@ class FlightWork:
         record = _record(result.status, result.reason_code, result.reason, result.measured, causes)
         if result.status == Status.FAILED:
             return _unkept(record, key)
-        self._tables |= {f"{stage.name}.{name}": frame for name, frame in result.tables.items()}
+        self._tables.keep(stage.name, result.tables)
         return self._kept(step, key, result.tables, record)
 
-    def _table(self, name: str) -> pl.DataFrame:
-        if name not in self._tables:
-            stage, table = name.split(".")
-            step = step_of(stage, self.table)
-            if stage == INGEST:
-                own = signals_of(self.table, self.records[INGEST]["signals"])[table]
-                self._tables[name] = read_signal(self._root, own, self.job.vehicle_id, self.job.flight_id)
-            else:
-                loaded = self._store.load(step, self.job.flight_id, str(self.records[step]["run_key"]), [table])
-                self._tables[name] = loaded[table]
-        return self._tables[name]
-
     def _kept(self, step: str, key: str, tables: Mapping[str, pl.DataFrame], record: Record) -> Record:
-        return _of_store(self._store.save(step, self.job.flight_id, key, tables, record))
+        hands_on = () if step == INGEST else _stage_of(step).hands_on
+        return _of_store(self._store.save(step, self.job.flight_id, key, tables, record, handed_on=hands_on))
 
 
 def _stage_of(step: str) -> Stage:
@@ -326,8 +315,10 @@ def _record(
 
 
 def _of_store(stored: dict[str, Json]) -> Record:
-    """A record as the warehouse gives it back: what was handed to it, with the outputs."""
-    return cast(Record, stored)
+    """A record as the warehouse gives it back: what was handed to it, with the outputs, of which those that lie in it
+    stay there: a night passes its records on."""
+    outputs = {name: {k: v for k, v in output.items() if k != "columns"} for name, output in outputs_of(stored).items()}
+    return cast(Record, {**stored, "outputs": outputs})
 
 
 def _unkept(record: Record, key: str) -> Record:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NotRequired, TypedDict
 
 from fieldcal.logs.facts import Facts
@@ -10,12 +10,14 @@ from fieldcal.names import Json
 
 
 class Output(TypedDict):
-    """A table that a step wrote. `file` and `bytes` of a stage's; a signal table lies elsewhere."""
+    """A table that a step wrote, as `StageOutput` has it; a signal table lies elsewhere."""
 
     sha256: str
     rows: int
     file: NotRequired[str]
     bytes: NotRequired[int]
+    columns: NotRequired[Mapping[str, Sequence[Json]]]
+    handed_on: NotRequired[bool]
 
 
 class Causes(TypedDict):

@@ -5,23 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import cast
 
 import polars as pl
 
 from fieldcal.config.stage_settings import Axes, Differentiation, Gravity, LocalField, as_json, from_json, taken_from
 from fieldcal.errors import FieldcalError
 from fieldcal.flight.calibrate import CalibratedLog
+from fieldcal.flight.record import Record
 from fieldcal.flight.rows import rows_frame
+from fieldcal.flight.stage_tables import StageTables
 from fieldcal.names import InitialAttitude, Json, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import SIGNAL_TABLES, SchemaMismatch
 from fieldcal.schemas.rows import DecisionRow, FitRow, SyncRow, UnfoldedFlight, UnfoldedRun
 from fieldcal.stages.composition import in_log
-from fieldcal.stages.pipeline import PIPELINE
-from fieldcal.warehouse import Warehouse, WarehouseError
+from fieldcal.stages.pipeline import INGEST, PIPELINE
+from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.decisions.withdrawn import decisions
 from fieldcal.warehouse.questions import existing
-from fieldcal.warehouse.stage_store import StageStore, outputs_of
+from fieldcal.warehouse.stage_store import StageStore
 from fieldcal.words.rows import rows_of, typed, unfolded
 
 STAGE_TABLES = (
@@ -91,7 +94,7 @@ def read_flight(root: Path, flight_id: str) -> FlightData:
         signal = _signal(warehouse, name, ids)
         if not signal.is_empty():
             tables[f"ingest.{name}"] = signal.drop("vehicle_id", "flight_id")
-    stages, parameters, gone = _stages(root, flight["flight_id"], run)
+    stages, parameters, gone = _stages(root, flight, run)
     sync = typed(rows_of(history["sync"]), SyncRow)
     return FlightData(
         flight,
@@ -156,31 +159,32 @@ def _signal(warehouse: Warehouse, name: str, ids: Mapping[str, str]) -> pl.DataF
 
 
 def _stages(
-    root: Path, flight_id: str, run: Sequence[UnfoldedRun]
+    root: Path, flight: UnfoldedFlight, run: Sequence[UnfoldedRun]
 ) -> tuple[dict[str, pl.DataFrame], dict[str, Json], tuple[str, ...]]:
-    """Tables that are there, the parameters of their stages, and the stages that should be there and are not."""
+    """Tables that are there or can be made again, the parameters of their stages, and the stages that should be there
+    and are not."""
     store = StageStore(root)
-    tables: dict[str, pl.DataFrame] = {}
     parameters: dict[str, Json] = {}
+    records: dict[str, Record] = {}
     gone = []
     for row in run:
         stage = row["stage"]
-        if stage == "ingest" or row["status"] == Status.FAILED:
+        if row["status"] == Status.FAILED:
             continue
-        record = store.record(stage, flight_id, str(row["run_key"]))
-        params = (record or {}).get("params")
-        if isinstance(params, Mapping):
-            parameters |= params
-        wanted = [name for name in STAGE_TABLES if name.split(".")[0] == stage]
-        if record is None:
+        record = store.record(stage, flight["flight_id"], str(row["run_key"]))
+        if record is not None:
+            records[stage] = cast(Record, record)
+            parameters |= records[stage]["params"] if stage != INGEST else {}
+        elif stage != INGEST:
             gone.append(stage)
+    written = StageTables(root, flight["vehicle_id"], flight["flight_id"], records)
+    tables: dict[str, pl.DataFrame] = {}
+    for name in STAGE_TABLES:
+        stage, table = name.split(".")
+        if stage not in records or table not in records[stage]["outputs"]:
             continue
-        for name in wanted:
-            table = name.split(".")[1]
-            if table not in outputs_of(record):
-                continue
-            try:
-                tables[name] = store.load(stage, flight_id, str(row["run_key"]), [table])[table]
-            except (WarehouseError, SchemaMismatch):
-                gone.append(stage)
+        try:
+            tables[name] = written[name]
+        except (FieldcalError, SchemaMismatch, KeyError, OSError, pl.exceptions.PolarsError):
+            gone.append(stage)
     return tables, parameters, tuple(gone)

@@ -58,9 +58,10 @@ def _stage(
     needs: tuple[str, ...],
     writes: tuple[str, ...],
     trusts: tuple[Sensor, ...] = (),
+    hands_on: tuple[str, ...] = (),
 ) -> Stage:
     """A stage whose function takes the settings that it is given."""
-    return Stage(name, function, takes, reads, needs, writes, trusts)
+    return Stage(name, function, takes, reads, needs, writes, trusts, hands_on)
 
 
 INGEST = "ingest"
@@ -98,6 +99,7 @@ PIPELINE: tuple[Stage, ...] = (
         {"imu": "ingest.imu", "magnetometer": "ingest.magnetometer", "segments": "manoeuvre.segments"},
         ("imu", "segments"),
         ("samples",),
+        hands_on=("samples",),
     ),
     _stage(
         "magnetometer",
@@ -125,6 +127,7 @@ PIPELINE: tuple[Stage, ...] = (
         ("samples",),
         ("attitude", "faults"),
         VECTOR_SENSORS,
+        hands_on=("attitude",),
     ),
     _stage(
         "gyro_equation",
@@ -157,6 +160,7 @@ PIPELINE: tuple[Stage, ...] = (
         ("samples",),
         ("attitude", "faults"),
         VECTOR_SENSORS,
+        hands_on=("attitude",),
     ),
     _stage(
         "vectors",
@@ -255,6 +259,7 @@ PIPELINE: tuple[Stage, ...] = (
         ("imu",),
         ("sync", "vps_aligned", "faults"),
         (Sensor.GYROSCOPE,),
+        hands_on=("vps_aligned",),
     ),
     _stage(
         "verify",

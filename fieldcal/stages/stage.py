@@ -24,7 +24,8 @@ AT = "@"
 @dataclass(frozen=True)
 class Stage:
     """One stage: `takes` is its part of the flight's settings, `reads` maps the function's own names to `stage.table`,
-    `needs` are those it cannot do without, `trusts` the sensors that must be free of fatal faults."""
+    `needs` are those it cannot do without, `trusts` the sensors that must be free of fatal faults. Of what it writes
+    all is kept but what it `hands_on`: tables that it makes again in less time than their files would take."""
 
     name: str
     function: Callable[[Tables, Any], StageResult]  # Any: settings of class `takes`, as `pipeline` checks
@@ -33,6 +34,7 @@ class Stage:
     needs: tuple[str, ...]
     writes: tuple[str, ...]
     trusts: tuple[Sensor, ...]
+    hands_on: tuple[str, ...] = ()
 
     @property
     def settings(self) -> tuple[str, ...]:

@@ -30,7 +30,8 @@ def root(tmp_path: Path) -> Path:
     position = {name: np.arange(50.0) for name in ("latitude_deg", "longitude_deg", "altitude_m")}
     with signal_writer(root, "position", "v", "a") as writer:
         writer.write({"t_ns": np.arange(50), **position})
-    cells = pl.DataFrame({"row": [0], "column": [0], "value": [1.0]})
+    side = np.arange(1600)  # too many to lie in the record
+    cells = pl.DataFrame({"row": side // 40, "column": side % 40, "value": np.random.default_rng(1).normal(size=1600)})
     StageStore(root).save("gyro_equation", "a", "k", {"covariance": cells}, {"status": "ok"})
     return root
 
