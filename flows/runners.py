@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import TYPE_CHECKING, Protocol
 
 from fieldcal.batch.documents import Answer, Batch
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 RUNNERS = ("process", "dask", "pool")
 LARGEST_BATCH = 10
+LARGEST_BATCH_BYTES = 64 << 20
+"""Of logs: what their flights are between two stages is held in memory together, some two to five times as much."""
 SMALLEST_BATCH = 2
 SHARE_OF_A_WORKER = 4
 
@@ -50,13 +53,16 @@ class Parallel:
 
 
 def batches(jobs: Sequence[Job], workers: int) -> list[list[Job]]:
-    """Jobs dealt out in batches, each a quarter of a worker's share of what is left, so that all end together."""
+    """Jobs dealt out in batches, each a quarter of a worker's share of what is left, so that all end together, and no
+    more bytes than a process is to hold."""
     smallest = min(SMALLEST_BATCH, -(-len(jobs) // workers))
     dealt: list[list[Job]] = []
     start = 0
     while start < len(jobs):
         share = -(-(len(jobs) - start) // (workers * SHARE_OF_A_WORKER))
         size = min(LARGEST_BATCH, max(smallest, share))
+        held = list(accumulate(job.size_bytes for job in jobs[start : start + size]))
+        size = max(1, sum(so_far <= LARGEST_BATCH_BYTES for so_far in held))
         dealt.append(list(jobs[start : start + size]))
         start += size
     return dealt

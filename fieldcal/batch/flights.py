@@ -1,7 +1,9 @@
-"""All steps of flights, one after the other, whoever runs each step. Nothing of Prefect here."""
+"""All steps of flights, whoever runs them: a batch goes through a step together, so that who watches over steps has one
+thing to do for all. Nothing of Prefect here."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -28,51 +30,125 @@ OTHER_CODE: list[str] = [
     "night ran, or the workers have another version. Nothing is lost; run it again.",
 ]
 
-Step = Callable[[FlightWork, str], object]
-"""Make sure that a step's result is there."""
+
+class Walk:
+    """A flight on its way through its steps. Whatever goes wrong costs this flight alone.
+
+    Parameters
+    ----------
+    root : Path
+        Data root of the warehouse.
+    job : Job
+        The log.
+    settings : Configuration
+    watched : bool
+        If it takes more than the limits, this process is ended, and whoever started it goes on from there.
+
+    Attributes
+    ----------
+    step : str or None
+        The step that comes next; None when there is none.
+    records, why : mapping
+        What each step left behind, and why those had to run that did.
+    """
+
+    def __init__(self, root: Path, job: Job, settings: Configuration, *, watched: bool = False) -> None:
+        self.job = job
+        self.records: dict[str, Record] = {}
+        self.why: dict[str, str] = {}
+        self.step: str | None = None
+        self._root, self._watched, self._limits = root, watched, settings.limits
+        self._vehicle = settings.vehicle(job.vehicle_id)
+        self._spent = {"seconds": 0.0, "cpu_seconds": 0.0}
+        self._work_s = 0.0
+        self._failed: Outcome | None = None
+        self._steps = self._all_steps(FlightWork(root, job, self._vehicle, self._limits))
+        self._go_on()
+
+    def take(self, step: str) -> None:
+        """Make sure that the result of a step is there, if it is the next.
+
+        Raises
+        ------
+        WarehouseError
+            What concerns every flight: the warehouse cannot be written.
+        """
+        if step != self.step:
+            return
+        work, began, cpu_began, before_s = self._work, time.monotonic(), time.process_time(), self._work.work_s
+        over = WATCH.over(self._root, self.job, self._vehicle, self._limits, self._spent)
+        with over if self._watched else nullcontext(_unwatched) as begins:
+            begins(step)
+            try:
+                work.do(step)
+            except WarehouseError:
+                raise
+            except Exception as error:
+                why = unforeseen(self.job.log_uri, error)
+                self._failed = failed_outcome(self.job, self.records | work.records, step, why)
+                self.step = None
+                return
+        self._spent["seconds"] += time.monotonic() - began
+        self._spent["cpu_seconds"] += time.process_time() - cpu_began
+        self._work_s += work.work_s - before_s
+        self.records |= work.records
+        self.why |= work.why
+        self._go_on()
+
+    def outcome(self) -> Outcome:
+        """What became of it, once no step is left."""
+        if self._failed is not None:
+            return self._failed
+        ran, cached = (tuple(step for step in self.records if (step in self.why) == new) for new in (True, False))
+        return Outcome(self.job, self.records, ran, cached, self.why, self._work_s)
+
+    def _go_on(self) -> None:
+        work, self.step = next(self._steps, (None, None))
+        if work is not None:
+            self._work = work
+
+    @staticmethod
+    def _all_steps(work: FlightWork) -> Iterator[tuple[FlightWork, str]]:
+        """Every step with the work that it is of; the next is asked for when one is done."""
+        yield work, INGEST
+        yield from ((work, step) for step in work.steps())
+        for other in work.further():
+            yield from ((other, step) for step in other.steps())
 
 
-def one_flight(
-    root: Path, job: Job, settings: Configuration, do: Step = FlightWork.do, *, watched: bool = False
-) -> Outcome:
-    """All steps of one flight. Whatever goes wrong costs this flight alone.
+Round = Callable[[str, Sequence[Walk]], object]
+"""Have flights take a step."""
 
-    `watched`: if it takes more than the limits, this process is ended, and whoever started it goes on from there.
+
+def take(step: str, walks: Sequence[Walk]) -> None:
+    """Have flights take a step, one after the other."""
+    for walk in walks:
+        walk.take(step)
+
+
+def together(walks: Sequence[Walk], do: Round = take) -> None:
+    """All steps of flights, each step of all that have it next at a time."""
+    while going := [walk for walk in walks if walk.step is not None]:
+        for step in dict.fromkeys(walk.step for walk in going):
+            if step is not None:
+                do(step, [walk for walk in going if walk.step == step])
+
+
+def one_flight(root: Path, job: Job, settings: Configuration) -> Outcome:
+    """All steps of one flight.
 
     Raises
     ------
     WarehouseError
-        What concerns every flight: the warehouse cannot be written.
+        What concerns every flight.
     """
-    records: dict[str, Record] = {}
-    why: dict[str, str] = {}
-    work_s = 0.0
-    vehicle, limits = settings.vehicle(job.vehicle_id), settings.limits
-    with WATCH.over(root, job, vehicle, limits) if watched else nullcontext(_unwatched) as begins:
-        for work, step in _steps(FlightWork(root, job, vehicle, limits)):
-            before_s = work.work_s
-            begins(step)
-            try:
-                do(work, step)
-            except WarehouseError:
-                raise
-            except Exception as error:
-                return failed_outcome(job, records | work.records, step, unforeseen(job.log_uri, error))
-            records, why, work_s = records | work.records, why | work.why, work_s + work.work_s - before_s
-    ran, cached = (tuple(step for step in records if (step in why) == new) for new in (True, False))
-    return Outcome(job, records, ran, cached, why, work_s)
+    walk = Walk(root, job, settings)
+    together([walk])
+    return walk.outcome()
 
 
 def _unwatched(step: str) -> None:
     pass
-
-
-def _steps(work: FlightWork) -> Iterator[tuple[FlightWork, str]]:
-    """Every step of a flight with the work that it is of; the next is asked for when one is done."""
-    yield work, INGEST
-    yield from ((work, step) for step in work.steps())
-    for other in work.further():
-        yield from ((other, step) for step in other.steps())
 
 
 def flights(
@@ -80,7 +156,7 @@ def flights(
     source: Source,
     jobs: Sequence[PlainJob],
     code: str,
-    do: Step = FlightWork.do,
+    do: Round = take,
     *,
     watched: bool = False,
 ) -> Answer:
@@ -89,19 +165,17 @@ def flights(
     `code` is the `code_digest` of the process that planned the night; a process with other code does nothing.
     `watched`: a log that takes more than its limits ends this process.
     """
-    outcomes: list[PlainOutcome] = []
     if code_digest() != code:
-        return {"outcomes": outcomes, "error": OTHER_CODE}
+        return {"outcomes": [], "error": OTHER_CODE}
     know_sources(Path(root), keep=False)
     settings = configuration_of(source)
+    walks = [Walk(Path(root), Job(**job), settings, watched=watched) for job in jobs]
     try:
         with one_thread():
-            for job in jobs:
-                outcome = one_flight(Path(root), Job(**job), settings, do, watched=watched)
-                outcomes.append(outcome.plain())
+            together(walks, do)
     except WarehouseError as error:
-        return {"outcomes": outcomes, "error": [error.reason_code, error.sentence]}
-    return {"outcomes": outcomes, "error": None}
+        return {"outcomes": [], "error": [error.reason_code, error.sentence]}
+    return {"outcomes": [walk.outcome().plain() for walk in walks], "error": None}
 
 
 def lost(job: PlainJob, reason: str) -> PlainOutcome:

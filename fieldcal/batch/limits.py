@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -59,15 +59,21 @@ class Watch:
         self._work = 0
 
     @contextmanager
-    def over(self, root: Path, job: Job, vehicle: Vehicle, limits: Limits) -> Iterator[Callable[[str], None]]:
-        """Watch the work on a log within the block; call what it gives with the name of each step that begins."""
+    def over(
+        self, root: Path, job: Job, vehicle: Vehicle, limits: Limits, spent: Mapping[str, float]
+    ) -> Iterator[Callable[[str], None]]:
+        """Watch the work on a log within the block; call what it gives with the name of each step that begins. What was
+        `spent` on the log before, by the name of its limit, counts."""
         with self._lock:
             self._work += 1
             circumstances = _circumstances(job, vehicle, limits)
 
             def begins(step: str) -> None:
                 told = {
-                    name: (most, seal({"of": circumstances, "why": _sentence(job, name, most, step)}).decode())
+                    name: (
+                        most - spent.get(name, 0.0),
+                        seal({"of": circumstances, "why": _sentence(job, name, most, step)}).decode(),
+                    )
                     for name, most in limits.model_dump().items()
                 }
                 self._tell({"work": self._work, "place": str(_place(root, job.flight_id)), "limits": told})

@@ -8,6 +8,10 @@ from pathlib import Path
 from typing import TypedDict
 
 
+STAMPS = 4
+"""Numbers that tell a file from what it was: size first."""
+
+
 class PlainJob(TypedDict):
     """A `Job` as plain JSON."""
 
@@ -35,6 +39,11 @@ class Job:
     flight_id: str
     stamp: Sequence[int] = ()
     problem: str | None = None
+
+    @property
+    def size_bytes(self) -> int:
+        """Of the log, as its stamp tells."""
+        return sum(self.stamp[::STAMPS])
 
     def plain(self) -> PlainJob:
         """Plain JSON; `Job(**plain)` is the job again."""

@@ -60,19 +60,20 @@ def test_a_dask_cluster_gives_the_same(archive: Path, content: str, tmp_path: Pa
     assert list(worked.values()) == [True, True]
 
 
-def test_every_step_in_two_processes_is_a_task_of_the_night(
+def test_every_stage_of_a_batch_is_a_task_of_the_night_in_two_processes(
     archive: Path, content: str, tmp_path: Path, prefect_server: str
 ) -> None:
     before = set(tasks_of_runs(prefect_server))
+    n_batches = len(batches([job(0)] * 6, 2))
     run_night(archive, tmp_path, None, None, 2)
     give_up = time.monotonic() + 20
     while True:
         (own,) = set(tasks_of_runs(prefect_server)) - before
         tasks = tasks_of_runs(prefect_server)[own]
-        if tasks["run_step"] == 6 * len(STEPS) or time.monotonic() > give_up:
+        if tasks["run_stage"] == n_batches * len(STEPS) or time.monotonic() > give_up:
             break
         time.sleep(0.2)
-    assert tasks == {"run_step": 6 * len(STEPS), "run_batch": len(batches([job(0)] * 6, 2)), "run_publish": 2}
+    assert tasks == {"run_stage": n_batches * len(STEPS), "run_batch": n_batches, "run_publish": 2}
 
 
 def tasks_of_runs(url: str) -> dict[str, Counter[str]]:
@@ -135,6 +136,15 @@ def test_batches_hold_every_job_once_and_shrink(n_jobs: int, workers: int) -> No
     assert max(sizes, default=0) <= LARGEST_BATCH
     if n_jobs > 4 * workers:
         assert sizes[-1] <= 4
+
+
+def test_batches_of_large_logs_are_small() -> None:
+    third = LARGEST_BATCH_BYTES // 3
+    jobs = [replace(job(n), stamp=(size, 1, 2, 3)) for n, size in enumerate([third] * 7 + [10 * third] * 2 + [1] * 3)]
+    dealt = batches(jobs, 1)
+    assert [one for batch in dealt for one in batch] == jobs
+    assert max(sum(one.size_bytes for one in batch) for batch in dealt if len(batch) > 1) <= LARGEST_BATCH_BYTES
+    assert [len(batch) for batch in dealt if batch[0].size_bytes > LARGEST_BATCH_BYTES] == [1, 1]
 
 
 def test_no_log_runs_in_this_process_and_no_process_starts_for_nothing() -> None:
