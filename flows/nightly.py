@@ -118,7 +118,7 @@ def carry_out(
     tell_while_heard()
     with alive(night.root):
         if watcher is not None:
-            watcher.planned(len(night.plan.jobs), len(night.plan.missing))
+            watcher.planned(len(night.plan.jobs), len(night.plan.missing), len(night.plan.done))
         outcomes = []
         for outcome in night.unchanged():
             outcomes.append(outcome)
@@ -127,6 +127,7 @@ def carry_out(
         outcomes += _calibrate(night, parallel, watcher, processes)
         for publishing in publishings(night, outcomes):
             publish_as_task(publishing)
+        night.remember(outcomes)
         closing = close_night(night.root, night.configuration.alerts)
         result = night.document(outcomes, closing)
         keep_artifact(result, night.root)

@@ -15,6 +15,7 @@ from fieldcal.batch.log_ledger import write_ledger
 from fieldcal.batch.outcome import Outcome, summary
 from fieldcal.batch.plan import Plan, make_plan
 from fieldcal.batch.publish_flights import publish_vehicle, take_out
+from fieldcal.batch.seen import Ledger
 from fieldcal.batch.sources import know_sources
 from fieldcal.config.configuration import Configuration
 from fieldcal.config.find import Source, configuration_of, find_source
@@ -27,7 +28,7 @@ from fieldcal.warehouse.layout import prepare
 class Watcher(Protocol):
     """Hears of the night's progress."""
 
-    def planned(self, flights: int, missing: int) -> None: ...
+    def planned(self, flights: int, missing: int, done: int) -> None: ...
     def done(self, outcome: Outcome) -> None: ...
 
 
@@ -47,16 +48,23 @@ class Night:
         return [job for job in self.plan.jobs if job.flight_id in self.plan.missing]
 
     def unchanged(self) -> Iterator[Outcome]:
-        """Outcomes of the flights all of whose results are there."""
+        """Outcomes of the flights that had to be looked at and all of whose results are there."""
         for job in self.plan.jobs:
             if job.flight_id in self.plan.unchanged:
                 records = self.plan.unchanged[job.flight_id]
                 yield Outcome(job, records, cached=tuple(records))
 
+    def remember(self, outcomes: Sequence[Outcome]) -> None:
+        """Remember, once it is published, what the next night need not look at."""
+        if outcomes or len(self.plan.done) < len(self.plan.jobs):
+            Ledger(self.root, self.configuration).remember(outcomes, self.plan.done)
+
     def document(self, outcomes: Sequence[Outcome], closing: Closing) -> NightDocument:
         """The JSON of the night, without how long it took."""
         changes = [change.row() for change in closing.changes]
-        told: dict[str, object] = dict(summary(outcomes, self.plan.copies, self.plan.copied, self.root))
+        told: dict[str, object] = dict(
+            summary(outcomes, self.plan.done.values(), self.plan.copies, self.plan.copied, self.root)
+        )
         unread = [asdict(one) for one in self.plan.unread]
         return cast(NightDocument, {**told, "changes": changes, "report": str(closing.report), "unread": unread})
 

@@ -103,10 +103,17 @@ def failed_outcome(job: Job, records: Mapping[str, Record], step: str, reason: s
     return Outcome(job, {**records, step: record}, ran=(step,))
 
 
-def summary(outcomes: Iterable[Outcome], copies: Mapping[str, str], copied: Iterable[Job], root: Path) -> NightSummary:
-    """The JSON of a night, without its duration."""
+def summary(
+    outcomes: Iterable[Outcome],
+    done: Iterable[LogEntry],
+    copies: Mapping[str, str],
+    copied: Iterable[Job],
+    root: Path,
+) -> NightSummary:
+    """The JSON of a night, without its duration. `done`: of flights that it had nothing to look at."""
     outcomes = list(outcomes)
-    entries = {outcome.job.log_uri: outcome.entry() for outcome in outcomes}
+    entries = {entry["log_uri"]: entry for entry in done}
+    entries |= {outcome.job.log_uri: outcome.entry() for outcome in outcomes}
     for job in copied:
         entries[job.log_uri] = _copy(job, copies[job.log_uri], entries, root)
     logs = [entries[log_uri] for log_uri in sorted(entries)]
@@ -117,7 +124,7 @@ def summary(outcomes: Iterable[Outcome], copies: Mapping[str, str], copied: Iter
         "quarantined": counts[Verdict.QUARANTINED],
         "rejected": counts[Verdict.REJECTED],
         "stages_run": sum(len(outcome.ran) for outcome in outcomes),
-        "stages_cached": sum(len(outcome.cached) for outcome in outcomes),
+        "stages_cached": sum(entry["stages_cached"] for entry in logs),
         "stage_seconds": round(sum(outcome.work_s for outcome in outcomes), 3),
         "logs": logs,
     }

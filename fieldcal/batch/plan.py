@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from fieldcal.batch.documents import LogEntry
 from fieldcal.batch.jobs import find_jobs, without_copies
 from fieldcal.batch.log_ledger import read_ledger
+from fieldcal.batch.seen import Ledger
 from fieldcal.batch.steps import FlightWork
 from fieldcal.config.configuration import Configuration
 from fieldcal.flight.job import Job
@@ -19,11 +21,13 @@ from fieldcal.warehouse import Warehouse
 class Plan:
     """A night before it runs.
 
-    `unchanged`: flights all of whose results are there, with their records; `missing`: flights with steps to run, each
-    with why; `copies`: log_uri → log_uri of the log it is a copy of; `unread`: what lies beside the logs.
+    `done`: flights that are as the last night left them, with what is said of them; `unchanged`: others all of whose
+    results are there, with their records; `missing`: flights with steps to run, each with why; `copies`: log_uri →
+    log_uri of the log it is a copy of; `unread`: what lies beside the logs.
     """
 
     jobs: list[Job] = field(default_factory=list)
+    done: dict[str, LogEntry] = field(default_factory=dict)
     unchanged: dict[str, dict[str, Record]] = field(default_factory=dict)
     missing: dict[str, dict[str, str]] = field(default_factory=dict)
     copies: dict[str, str] = field(default_factory=dict)
@@ -37,10 +41,14 @@ def make_plan(root: Path, archive: Path, configuration: Configuration, session: 
     kept, copies = without_copies(found, *_known(root, archive))
     unread = find_unread(archive, {job.log_uri for job in found}, session)
     plan = Plan(copies=copies, copied=[job for job in found if job.log_uri in copies], unread=unread)
+    seen = Ledger(root, configuration)
     for job in kept:
+        plan.jobs.append(job)
+        if (entry := seen.entry(job)) is not None:
+            plan.done[job.flight_id] = entry
+            continue
         work = FlightWork(root, job, configuration.vehicle(job.vehicle_id), configuration.limits)
         pending = work.pending()
-        plan.jobs.append(job)
         if pending:
             plan.missing[job.flight_id] = pending
         else:

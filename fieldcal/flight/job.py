@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypedDict
 
-
 STAMPS = 4
 """Numbers that tell a file from what it was: size first."""
 

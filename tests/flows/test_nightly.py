@@ -280,7 +280,7 @@ class Bar:
         self.lock = threading.Lock()
         self.told: list[tuple[str, int]] = []
 
-    def planned(self, flights: int, missing: int) -> None:
+    def planned(self, flights: int, missing: int, done: int) -> None:
         self.told.append(("planned", missing))
 
     def done(self, outcome: Outcome) -> None:

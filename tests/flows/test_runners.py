@@ -8,6 +8,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from fieldcal.flight.job import Job
 from fieldcal.flows.connection import connected
 from fieldcal.flows.pool import hand_over
 from fieldcal.flows.run import run_night
-from fieldcal.flows.runners import LARGEST_BATCH, Parallel, batches
+from fieldcal.flows.runners import LARGEST_BATCH, LARGEST_BATCH_BYTES, Parallel, batches
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse.content import content_sha256

@@ -23,9 +23,9 @@ class NightProgress:
         self._total = 0
         self._done = 0
 
-    def planned(self, flights: int, missing: int) -> None:
-        """The night knows what it has to do."""
-        self._total = flights
+    def planned(self, flights: int, missing: int, done: int) -> None:
+        """The night knows what it has to do; of `done` flights it hears nothing more."""
+        self._total, self._done = flights, done
         say(f"{flights} logs, {missing} of them new or changed")
         if sys.stderr.isatty() and missing:
             from rich.console import Console
@@ -34,7 +34,7 @@ class NightProgress:
             name = TextColumn("{task.description}", markup=False)
             columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), name)
             self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
-            self._bar.add_task("", total=flights)
+            self._bar.add_task("", total=flights, completed=done)
             self._bar.start()
 
     def done(self, outcome: Outcome) -> None:

@@ -1,0 +1,148 @@
+"""What the last night found whole: flights whose results need not be looked at again.
+
+Of each flight it is remembered what its results follow from, which files they are with their size, times and inode, and
+what the night says of it. Where all of that is as it was, and the history of its vehicle too, the flight is done:
+a thousand flights cost some tenths of a second. What changes a byte without changing its file's times is for
+`fieldcal verify` to find. The file may be deleted at any time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TypedDict, cast
+
+from fieldcal.batch.documents import LogEntry
+from fieldcal.batch.limits import why_ended
+from fieldcal.batch.outcome import Outcome
+from fieldcal.batch.sources import sources
+from fieldcal.config.configuration import Configuration
+from fieldcal.flight.job import Job
+from fieldcal.flight.record import Record
+from fieldcal.flight.versions import versions
+from fieldcal.schemas import FLIGHT_TABLES
+from fieldcal.stages.pipeline import INGEST
+from fieldcal.warehouse.files import write_bytes
+from fieldcal.warehouse.layout import checksum_path, history_path, signal_path, stage_folder
+from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
+from fieldcal.warehouse.stage_store import RECORD
+
+
+class Seen(TypedDict):
+    """A flight. `of`: digest of what its results follow from; `files`: below the data root; `as_they_were`: digest of
+    their stamps; `entry`: its place in the JSON of a night that has nothing to do for it."""
+
+    of: str
+    files: list[str]
+    as_they_were: str
+    entry: LogEntry
+
+
+class Ledger:
+    """What is remembered, asked about one flight after the other."""
+
+    def __init__(self, root: Path, configuration: Configuration) -> None:
+        self._root, self._configuration = root, configuration
+        self._flights: Mapping[str, Seen] = {}
+        self._histories: Mapping[str, str] = {}
+        try:
+            found = unseal(_place(root).read_bytes())
+            self._flights = cast(Mapping[str, Seen], found["flights"])
+            self._histories = cast(Mapping[str, str], found["histories"])
+        except (OSError, BrokenSeal, KeyError):
+            pass
+        self._common = _common()
+        self._same_history: dict[str, bool] = {}
+
+    def entry(self, job: Job) -> LogEntry | None:
+        """What to say of a flight of which everything is as it was; None of any other."""
+        known = self._flights.get(job.flight_id)
+        if known is None or not self._history_is_same(job.vehicle_id):
+            return None
+        if known["of"] != _of(job, self._configuration, self._common):
+            return None
+        return known["entry"] if _stamps(self._root, known["files"]) == known["as_they_were"] else None
+
+    def remember(self, outcomes: Iterable[Outcome], done: Mapping[str, LogEntry]) -> None:
+        """Remember a night's flights: the outcomes, all of whose results were kept, and those that were `done`."""
+        flights: dict[str, Seen] = {flight_id: self._flights[flight_id] for flight_id in done}
+        vehicles = {entry["vehicle_id"] for entry in done.values()}
+        for outcome in outcomes:
+            vehicles.add(outcome.job.vehicle_id)
+            seen = self._seen(outcome)
+            if seen is not None:
+                flights[outcome.job.flight_id] = seen
+        others = {flight_id: seen for flight_id, seen in self._flights.items() if flight_id not in flights}
+        kept = {flight_id: seen for flight_id, seen in others.items() if seen["entry"]["vehicle_id"] not in vehicles}
+        histories = {**self._histories, **{vehicle: _history(self._root, vehicle) for vehicle in vehicles}}
+        sealed = seal({"flights": {**kept, **flights}, "histories": histories})
+        write_bytes(_place(self._root), sealed, durable=False)
+
+    def _seen(self, outcome: Outcome) -> Seen | None:
+        job, records = outcome.job, outcome.records
+        vehicle = self._configuration.vehicle(job.vehicle_id)
+        if any(record.get("unkept") or record["run_key"] is None for record in records.values()):
+            return None
+        if why_ended(self._root, job, vehicle, self._configuration.limits):
+            return None
+        files = sorted(_files(self._root, job, records))
+        entry: LogEntry = {**outcome.entry(), "stages_run": 0, "stages_cached": len(records), "ran": {}}
+        of = _of(job, self._configuration, self._common)
+        return {"of": of, "files": files, "as_they_were": _stamps(self._root, files), "entry": entry}
+
+    def _history_is_same(self, vehicle_id: str) -> bool:
+        if vehicle_id not in self._same_history:
+            known = self._histories.get(vehicle_id)
+            self._same_history[vehicle_id] = known is not None and known == _history(self._root, vehicle_id)
+        return self._same_history[vehicle_id]
+
+
+def _common() -> str:
+    """Digest of what every flight's results follow from."""
+    return json.dumps([dict(sources()), versions()], sort_keys=True)
+
+
+def _of(job: Job, configuration: Configuration, common: str) -> str:
+    """Digest of what a flight's results, and what is said of it, follow from."""
+    vehicle, limits = configuration.vehicle(job.vehicle_id), configuration.limits
+    parts = (job.plain(), vehicle.model_dump_json(), limits.model_dump_json(), common)
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def _files(root: Path, job: Job, records: Mapping[str, Record]) -> Iterable[str]:
+    for step, record in records.items():
+        folder = stage_folder(root, step, job.flight_id, str(record["run_key"]))
+        yield str((folder / RECORD).relative_to(root))
+        for output in record["outputs"].values():
+            if "file" in output:
+                yield str((folder / output["file"]).relative_to(root))
+    for table in records[INGEST]["signals"]:
+        yield str(signal_path(root, table, job.vehicle_id, job.flight_id).relative_to(root))
+
+
+def _stamps(root: Path, files: Sequence[str]) -> str:
+    """Digest of the files' sizes, times and inodes; one that is absent is none."""
+    digest = hashlib.sha256()
+    for file in files:
+        try:
+            stat = os.stat(root / file)
+        except OSError:
+            digest.update(f"{file}\\0".encode("utf-8", "surrogateescape"))
+            continue
+        stamp = (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino)
+        digest.update(f"{file}\\0{stamp}\\0".encode("utf-8", "surrogateescape"))
+    return digest.hexdigest()
+
+
+def _history(root: Path, vehicle_id: str) -> str:
+    """Digest of what is recorded of a vehicle's history, and of its files' stamps."""
+    paths = [history_path(root, table, vehicle_id) for table in FLIGHT_TABLES]
+    files = [path for path in paths for path in (path, checksum_path(root, path))]
+    return _stamps(root, [str(path.relative_to(root)) for path in files])
+
+
+def _place(root: Path) -> Path:
+    return root / "night" / "seen.json"
