@@ -183,9 +183,18 @@ class Motion:
     def attitude(self, t: Array) -> Array:
         return from_euler(self.euler(t)[0])
 
-    def rate(self, t: Array) -> Array:
-        """Body rates, rad/s, from the 3-2-1 Euler kinematics."""
+    def attitude_and_rate(self, t: Array) -> tuple[Array, Array]:
+        """Both for the price of one."""
         angle, dot = self.euler(t)
+        return from_euler(angle), self._body_rate(angle, dot)
+
+    def rate(self, t: Array) -> Array:
+        """Body rates, rad/s."""
+        return self._body_rate(*self.euler(t))
+
+    @staticmethod
+    def _body_rate(angle: Array, dot: Array) -> Array:
+        """3-2-1 Euler kinematics."""
         (sf, cf), (st, ct) = ((np.sin(angle[:, i]), np.cos(angle[:, i])) for i in (0, 1))
         return np.stack(
             [dot[:, 0] - st * dot[:, 2], cf * dot[:, 1] + sf * ct * dot[:, 2], -sf * dot[:, 1] + cf * ct * dot[:, 2]],
@@ -199,11 +208,11 @@ class Motion:
 
     def acceleration(self, t: Array) -> Array:
         """Translational acceleration of the centre of mass, m/s², NED."""
-        return self._sum(self.translation, t, 0)
+        return self._sum(self.translation, t, 0) if np.any(self.translation[0]) else np.zeros((len(t), 3))
 
     def position(self, t: Array) -> Array:
         """Position, m, NED: the acceleration integrated twice."""
-        return self._sum(self.translation, t, -2)
+        return self._sum(self.translation, t, -2) if np.any(self.translation[0]) else np.zeros((len(t), 3))
 
 
 def _sinusoids(
@@ -268,6 +277,7 @@ def simulate(experiment: Experiment | None = None, **changes: object) -> Simulat
         from_rotation_vector(e.vps_misalignment_rad * _unit(streams["vps"])),
     )
     vps_t, vps_q, vps_position = _vps(e, motion, streams["vps"], world, body)
+    q, rate = motion.attitude_and_rate(t - delay_s)
     return SimulatedFlight(
         experiment=e,
         t=t,
@@ -276,8 +286,8 @@ def simulate(experiment: Experiment | None = None, **changes: object) -> Simulat
         vps_t=vps_t,
         vps_q=vps_q,
         vps_position=vps_position,
-        q=motion.attitude(t - delay_s),
-        rate=motion.rate(t - delay_s),
+        q=q,
+        rate=rate,
         delay_s=delay_s,
         vps_world_rotation=world,
         vps_body_rotation=body,
@@ -311,8 +321,8 @@ def _sensed(e: Experiment, motion: Motion, t: Array, streams: dict[str, Generato
         step = 1.0 / (oversampling * e.rate_hz)
         fine = np.arange(-0.3, e.duration_s + 0.1, step)
     field_n = np.array([np.cos(e.dip_rad), 0.0, np.sin(e.dip_rad)])
-    a_bn = body_from_inertial(motion.attitude(fine))
-    rate = motion.rate(fine)
+    attitude, rate = motion.attitude_and_rate(fine)
+    a_bn = body_from_inertial(attitude)
     arm = np.array(e.lever_arm_m)
     rotation = np.cross(motion.rate_dot(fine), arm) + np.cross(rate, np.cross(rate, arm)) if arm.any() else 0.0
     gravity = np.array([0.0, 0.0, e.gravity_mps2])

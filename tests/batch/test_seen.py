@@ -106,7 +106,7 @@ def test_another_configuration_is_another_flight(fleet: Fleet) -> None:
     path.write_text(f"{known}\n[limits]\nseconds = 999\n")
     assert fleet.plan() == (0, VEHICLES, 0)
     (header,) = [line for line in known.splitlines() if line.startswith("[vehicles") and line.endswith('1"]')]
-    path.write_text(known.replace(header, f"{header}\nsmoothing_cutoff_hz = 5.0"))
+    path.write_text(known.replace(header, f"{header}\nparameters = {{ smoothing_cutoff_hz = 5.0 }}"))
     assert fleet.plan() == (1, 0, 1)
 
 

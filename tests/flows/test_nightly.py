@@ -141,6 +141,7 @@ def test_a_history_of_an_older_release_is_shown_and_brought_up_to_date(simulated
         assert run([*command.split(), "--warehouse", str(warehouse)]) == 0, command
     result = run_night(simulated, warehouse, None, None, 1)
     assert (result["stages_run"], result["ok"]) == (0, 2)
+    shutil.rmtree(warehouse / "tables" / "export")  # the only thing that these commands write
     assert (content_sha256(warehouse), file_hashes(warehouse / "tables")) == before
 
 
