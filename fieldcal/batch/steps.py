@@ -40,7 +40,7 @@ from fieldcal.stages.stage import Stage, run_stage, stage_and_unit, step_of
 from fieldcal.warehouse.checksums import problem
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.files import file_sha256
-from fieldcal.warehouse.layout import signal_path
+from fieldcal.warehouse.layout import checksum_path, signal_path
 from fieldcal.warehouse.signals import signal_writer
 from fieldcal.warehouse.stage_store import StageStore, outputs_of
 from fieldcal.warehouse.store import TableWriter
@@ -84,7 +84,7 @@ class FlightWork:
         self._vehicle = vehicle
         self._settings: FlightSettings | None = None
         self._inputs: dict[str, str] = {}
-        self._tables = StageTables(root, job.vehicle_id, job.flight_id, self.records, table)
+        self._tables = StageTables(root, job.vehicle_id, job.flight_id, self.records, table, self._read_again)
 
     def usable(self) -> bool:
         """Whether ingest left anything to calibrate on; known once its record is."""
@@ -256,12 +256,25 @@ class FlightWork:
         return self._kept(INGEST, key, {}, record) if keep else _unkept(record, key)
 
     def _signals_whole(self, record: Record) -> bool:
-        return all(self._whole(table, written["sha256"]) for table, written in record["signals"].items())
+        """Whether the readings are what ingest wrote, and what everybody else holds them against says so too; or were
+        removed, all of them, and nothing needs them."""
+        paths = self._signal_paths(record)
+        if paths and not any(path.exists() for path in paths.values()):
+            return not any(checksum_path(self._root, path).exists() for path in paths.values())
+        return all(self._whole(path, record["signals"][table]["sha256"]) for table, path in paths.items())
 
-    def _whole(self, table: str, sha256: str) -> bool:
-        """Whether readings are what ingest wrote, and what everybody else holds them against says so too."""
-        path = signal_path(self._root, table, self.job.vehicle_id, self.job.flight_id)
+    def _whole(self, path: Path, sha256: str) -> bool:
         return path.exists() and file_sha256(path) == sha256 and problem(self._root, path, sha256) is None
+
+    def _signal_paths(self, record: Record) -> dict[str, Path]:
+        return {t: signal_path(self._root, t, self.job.vehicle_id, self.job.flight_id) for t in record["signals"]}
+
+    def _read_again(self) -> None:
+        """Read the log once more: readings that are needed were removed."""
+        try:
+            self._write_signals(whole=False)
+        except Disordered:
+            self._write_signals(whole=True)
 
     # --- stages
 

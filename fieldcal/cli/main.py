@@ -18,6 +18,7 @@ from fieldcal.cli.fly import apply, compare, export
 from fieldcal.cli.interrupt import interruptible
 from fieldcal.cli.look import init, inspect
 from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
+from fieldcal.cli.prune import prune
 from fieldcal.cli.report import report as report_command
 from fieldcal.cli.serve import serve, trigger
 from fieldcal.cli.simulate import simulate
@@ -417,6 +418,7 @@ app.command(config_app)
 app.command(report_command, name="report")
 app.command(serve)
 app.command(trigger)
+app.command(prune)
 app.command(simulate)
 app.command(drift)
 app.command(export)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import polars as pl
@@ -14,6 +14,7 @@ from fieldcal.logs.on_board import PRIMARY, signals_of
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.pipeline import INGEST, PIPELINE
 from fieldcal.stages.stage import Stage, step_of
+from fieldcal.warehouse.layout import signal_path
 from fieldcal.warehouse.rows_as_json import digest
 from fieldcal.warehouse.signals import read_signal
 from fieldcal.warehouse.stage_store import StageStore, is_kept, outputs_of
@@ -34,13 +35,21 @@ class StageTables:
         Step → what it left behind; it may grow, and what it lists may change.
     table : str
         The unit, by the table of its readings.
+    read_again : callable, optional
+        Has the log read once more, for readings that were removed to make room.
     """
 
     def __init__(
-        self, root: Path, vehicle_id: str, flight_id: str, records: Mapping[str, Record], table: str = PRIMARY
+        self,
+        root: Path,
+        vehicle_id: str,
+        flight_id: str,
+        records: Mapping[str, Record],
+        table: str = PRIMARY,
+        read_again: Callable[[], None] | None = None,
     ) -> None:
         self._root, self._vehicle_id, self._flight_id = root, vehicle_id, flight_id
-        self._records, self._unit = records, table
+        self._records, self._unit, self._read_again = records, table, read_again
         self._store = StageStore(root)
         self._at_hand: dict[str, pl.DataFrame] = {}
 
@@ -67,6 +76,9 @@ class StageTables:
     def _read(self, stage: str, table: str) -> pl.DataFrame:
         if stage == INGEST:
             own = signals_of(self._unit, self._records[INGEST]["signals"])[table]
+            there = signal_path(self._root, own, self._vehicle_id, self._flight_id).exists()
+            if not there and self._read_again is not None:
+                self._read_again()
             return read_signal(self._root, own, self._vehicle_id, self._flight_id)
         step = step_of(stage, self._unit)
         record = self._records[step]
