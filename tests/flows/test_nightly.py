@@ -180,7 +180,7 @@ def test_a_changed_cut_off_runs_smoothing_and_what_reads_from_it(archive: Path, 
 def test_a_deleted_or_edited_result_is_made_again(simulated: Path, warehouse: Path) -> None:
     content = content_sha256(warehouse)
     shutil.rmtree(warehouse / "stages" / "accelerometer")
-    edited = next((warehouse / "stages" / "verify").rglob("*.parquet"))
+    edited = next((warehouse / "stages" / "verify").rglob("run.json"))
     edited.write_bytes(edited.read_bytes()[:-1])
     signal_file = next((warehouse / "signals" / "vps").rglob("*.parquet"))
     signal_file.unlink()
