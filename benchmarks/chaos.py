@@ -150,7 +150,7 @@ DEEDS: dict[str, Deed] = {
 def settled(fleet: Fleet, expected: str) -> str | None:
     """Run the night that must end well; what is wrong, None where nothing is."""
     from fieldcal.warehouse.content import content_sha256
-    from fieldcal.warehouse.verify import verify
+    from fieldcal.warehouse.upkeep.verify import verify
 
     process = fleet.night()
     told, talk = process.communicate(timeout=PATIENCE_S)

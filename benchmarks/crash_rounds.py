@@ -98,7 +98,7 @@ def main() -> None:
     from fieldcal.simulation.archive import write_flights
     from fieldcal.simulation.experiment import Experiment
     from fieldcal.warehouse.content import content_sha256
-    from fieldcal.warehouse.verify import verify
+    from fieldcal.warehouse.upkeep.verify import verify
 
     with tempfile.TemporaryDirectory() as folder, running_server(Path(folder) / "server") as server:
         server.wait()

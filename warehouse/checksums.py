@@ -84,11 +84,8 @@ def assure(root: Path, paths: Iterable[Path], *, strict: bool = False) -> None:
             if wrong is None:
                 break
         else:
-            raise WarehouseError(
-                ReasonCode.DAMAGED_FILE,
-                f"{path} is damaged ({wrong}); `fieldcal verify` lists what else is. Restore it, or remove it and "
-                f"{checksum_path(root, path)} and run the night again: the flights are calibrated anew.",
-            )
+            told = f"{path} is damaged ({wrong}); `fieldcal verify` lists what else is. {remedy(root, path)}"
+            raise WarehouseError(ReasonCode.DAMAGED_FILE, told)
 
 
 def _wrong(root: Path, path: Path, strict: bool) -> str | None:
@@ -101,6 +98,14 @@ def _wrong(root: Path, path: Path, strict: bool) -> str | None:
         except BrokenSeal:
             return None
     return problem(root, path, file_sha256(path))
+
+
+def remedy(root: Path, path: Path) -> str:
+    """What to do about a damaged file: what people decided and exported no night makes anew."""
+    beside = checksum_path(root, path)
+    if path.is_relative_to(root / "tables") and path.relative_to(root / "tables").parts[0] in ("decision", "export"):
+        return f"Restore it: no night makes it anew. Without a copy of it, remove it and {beside}, and decide again."
+    return f"Restore it, or remove it and {beside} and run the night again: the flights are calibrated anew."
 
 
 def history_digest(root: Path, tables: Iterable[str]) -> str:

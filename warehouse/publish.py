@@ -21,7 +21,7 @@ from fieldcal.warehouse import checksums
 from fieldcal.warehouse.decisions.withdrawn import DECIDED, as_decided, decisions
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import write_bytes
-from fieldcal.warehouse.layout import checksum_path, history_path
+from fieldcal.warehouse.layout import history_path
 from fieldcal.warehouse.lock import vehicle_lock
 from fieldcal.warehouse.store import conform, empty_frame, frame, read_arrow, read_table, table_bytes
 
@@ -134,11 +134,8 @@ def _existing(root: Path, path: Path, table: str) -> tuple[bytes | None, pl.Data
     with disk(path, "read"):
         data = path.read_bytes()
     if problem := checksums.problem(root, path, hashlib.sha256(data).hexdigest()):
-        raise WarehouseError(
-            ReasonCode.DAMAGED_FILE,
-            f"{path} is damaged ({problem}), and nothing is published over it. Restore it, or remove it and "
-            f"{checksum_path(root, path)} and run the night again: the flights are calibrated anew.",
-        )
+        told = f"{path} is damaged ({problem}), and nothing is published over it. {checksums.remedy(root, path)}"
+        raise WarehouseError(ReasonCode.DAMAGED_FILE, told)
     return data, frame(read_arrow(data, table, name=str(path)))
 
 

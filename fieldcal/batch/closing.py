@@ -24,7 +24,7 @@ from fieldcal.warehouse.lock import fleet_lock
 from fieldcal.warehouse.publish import settle
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 from fieldcal.warehouse.store import read_facts
-from fieldcal.warehouse.verify import night_files
+from fieldcal.warehouse.upkeep.verify import night_files
 
 INPUTS = (*FLIGHT_TABLES, "decision")
 MOST_PAGES = 10

@@ -11,11 +11,11 @@ import polars as pl
 
 from fieldcal.batch.closing import Closing
 from fieldcal.batch.documents import NightDocument
-from fieldcal.batch.log_ledger import write_ledger
+from fieldcal.batch.ledgers.flights import Ledger
+from fieldcal.batch.ledgers.logs import write_ledger
 from fieldcal.batch.outcome import Outcome, summary
 from fieldcal.batch.plan import Plan, make_plan
 from fieldcal.batch.publish_flights import publish_vehicle, take_out
-from fieldcal.batch.seen import Ledger
 from fieldcal.batch.sources import know_sources
 from fieldcal.config.configuration import Configuration
 from fieldcal.config.find import Source, configuration_of, find_source

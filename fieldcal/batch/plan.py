@@ -7,8 +7,8 @@ from pathlib import Path
 
 from fieldcal.batch.documents import LogEntry
 from fieldcal.batch.jobs import find_jobs, without_copies
-from fieldcal.batch.log_ledger import read_ledger
-from fieldcal.batch.seen import Ledger
+from fieldcal.batch.ledgers.flights import Ledger
+from fieldcal.batch.ledgers.logs import read_ledger
 from fieldcal.batch.steps import FlightWork
 from fieldcal.config.configuration import Configuration
 from fieldcal.flight.job import Job

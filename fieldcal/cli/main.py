@@ -231,7 +231,7 @@ def verify(
     """
     from fieldcal.cli.show import print_json
     from fieldcal.logs import log_sha256
-    from fieldcal.warehouse.verify import verify as check
+    from fieldcal.warehouse.upkeep.verify import verify as check
     from fieldcal.words.talk import say
 
     if archive is not None:
@@ -254,7 +254,7 @@ def upgrade(*, dry_run: DryRun = False, as_json: AsJson = False, warehouse: Root
     May be interrupted and repeated. A file that cannot be upgraded is named and left as it is (exit code 3).
     """
     from fieldcal.cli.show import print_json
-    from fieldcal.warehouse.upgrade import upgrade as bring
+    from fieldcal.warehouse.upkeep.upgrade import upgrade as bring
     from fieldcal.words.talk import say
 
     result = bring(_root(warehouse), dry_run=dry_run)

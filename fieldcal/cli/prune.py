@@ -36,9 +36,9 @@ def prune(
     """
     from fieldcal.cli.show import print_json
     from fieldcal.warehouse.lock import fleet_lock
-    from fieldcal.warehouse.prune import all_results, former_results, of_vehicle, remove
-    from fieldcal.warehouse.prune import signals_before as old_signals
     from fieldcal.warehouse.questions import existing, moment_of
+    from fieldcal.warehouse.upkeep.prune import all_results, former_results, of_vehicle, remove
+    from fieldcal.warehouse.upkeep.prune import signals_before as old_signals
 
     root = existing(fieldcal.Warehouse(warehouse).root).root
     removable = [all_results(root) if stages else former_results(root)]

@@ -26,7 +26,7 @@ from fieldcal.warehouse.layout import checksum_path
 from fieldcal.warehouse.publish import read_history
 from fieldcal.warehouse.signals import read_signal
 from fieldcal.warehouse.stage_store import StageStore
-from fieldcal.warehouse.verify import verify
+from fieldcal.warehouse.upkeep.verify import verify
 
 FLIPS = 60 if os.environ.get("CI") else 400
 PLACES = ("tables", "signals", "stages", "reports", "night", "checksums")

@@ -17,7 +17,7 @@ from outside_ci import outside_ci
 
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
-from fieldcal.warehouse.verify import verify
+from fieldcal.warehouse.upkeep.verify import verify
 
 REPOSITORY = Path(__file__).parents[2]
 PATIENCE_S = 120.0

@@ -27,7 +27,7 @@ from fieldcal.simulation.experiment import Experiment
 from fieldcal.stages.pipeline import INGEST
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.sealed import seal
-from fieldcal.warehouse.verify import verify
+from fieldcal.warehouse.upkeep.verify import verify
 
 PATIENCE_S = 20.0
 ROWS_TOO_MANY = 600_000

@@ -9,7 +9,7 @@ import pytest
 
 from fieldcal.batch import jobs, log_ledger
 from fieldcal.batch.jobs import find_jobs
-from fieldcal.batch.log_ledger import read_ledger, write_ledger
+from fieldcal.batch.ledgers.logs import read_ledger, write_ledger
 from fieldcal.config.configuration import load
 from fieldcal.flight.job import Job
 from fieldcal.logs import log_sha256

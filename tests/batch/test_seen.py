@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import fieldcal
-from fieldcal.batch import seen
 from fieldcal.batch.flights import one_flight
+from fieldcal.batch.ledgers import flights as seen
 from fieldcal.batch.night import Night, plan_night, publishings
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment

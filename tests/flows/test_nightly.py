@@ -31,7 +31,7 @@ from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.content import content_sha256
 from fieldcal.warehouse.layout import history_files
-from fieldcal.warehouse.verify import verify
+from fieldcal.warehouse.upkeep.verify import verify
 
 REPOSITORY = Path(__file__).parents[2]
 

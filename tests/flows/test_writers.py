@@ -14,7 +14,7 @@ from fieldcal.flows.run import run_night
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse.content import content_sha256
-from fieldcal.warehouse.verify import verify
+from fieldcal.warehouse.upkeep.verify import verify
 
 STAGE_RECORDS = 2 * len(STEPS)
 

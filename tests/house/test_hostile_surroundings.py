@@ -23,7 +23,7 @@ from fieldcal.flight.threads import one_thread
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.verify import verify
+from fieldcal.warehouse.upkeep.verify import verify
 
 REPOSITORY = Path(__file__).parents[2]
 FILE_LIMIT_BYTES = 60_000

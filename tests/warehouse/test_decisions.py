@@ -21,7 +21,7 @@ from fieldcal.warehouse.decisions.withdrawn import as_decided, withdrawn_flights
 from fieldcal.warehouse.decisions.withdrawn import decisions as standing
 from fieldcal.warehouse.publish import append, publish, read_history, settle
 from fieldcal.warehouse.questions import units_flown
-from fieldcal.warehouse.verify import verify
+from fieldcal.warehouse.upkeep.verify import verify
 
 NOW = dt.datetime(2026, 7, 1, tzinfo=dt.UTC)
 FLIGHTS = [f"{n}{n:0>15}" for n in range(1, 7)]
@@ -197,3 +197,12 @@ def test_decisions_of_one_moment_about_many_flights(root: Path) -> None:
     n = decisions.decide(root, flights, Decision.WITHDRAW, reason="r", author="a", part={}, now=NOW)
     assert n == 30
     assert set(standing(root)["decided_at"]) == {NOW}
+
+
+def test_damage_to_what_no_night_makes_anew_says_so(root: Path) -> None:
+    fieldcal.Warehouse(root).withdraw(FLIGHTS[0], reason="x")
+    path = next((root / "tables" / "decision").rglob("*.parquet"))
+    path.write_bytes(path.read_bytes()[:-1])
+    for asked in (lambda: standing(root), lambda: fieldcal.Warehouse(root).withdraw(FLIGHTS[1], reason="x")):
+        with pytest.raises(FieldcalError, match="no night makes it anew"):
+            asked()

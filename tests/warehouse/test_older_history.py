@@ -20,7 +20,7 @@ from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.layout import history_path, signal_path
 from fieldcal.warehouse.publish import publish, read_history
 from fieldcal.warehouse.signals import read_signal, signal_writer
-from fieldcal.warehouse.verify import verify
+from fieldcal.warehouse.upkeep.verify import verify
 
 READ: dict[str, Callable[[Path, str], pl.DataFrame]] = {
     "polars": lambda root, table: Warehouse(root).scan(table, vehicle_id="a").collect(),

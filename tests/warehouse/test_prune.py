@@ -20,9 +20,9 @@ from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.content import content_sha256
-from fieldcal.warehouse.prune import all_results, former_results, of_vehicle, remove, signals_before
 from fieldcal.warehouse.publish import read_history
-from fieldcal.warehouse.verify import verify
+from fieldcal.warehouse.upkeep.prune import all_results, former_results, of_vehicle, remove, signals_before
+from fieldcal.warehouse.upkeep.verify import verify
 
 
 def night(folder: Path) -> tuple[int, int]:

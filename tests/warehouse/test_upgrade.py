@@ -34,8 +34,8 @@ from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.layout import history_files, history_path
 from fieldcal.warehouse.publish import publish, read_history
 from fieldcal.warehouse.store import empty_frame
-from fieldcal.warehouse.upgrade import upgrade
-from fieldcal.warehouse.verify import verify
+from fieldcal.warehouse.upkeep.upgrade import upgrade
+from fieldcal.warehouse.upkeep.verify import verify
 
 OLDER = Path(__file__).parent / "older"
 """`tables/` and their checksums, of two simulated flights of sim-1, named by the commit whose night made them: the
@@ -138,7 +138,7 @@ def test_a_night_on_top_keeps_what_was_there(upgraded: bool, tmp_path: Path) -> 
 KILLED_AT_EVERY_RENAME = """
 import os, shutil, signal, sys
 from pathlib import Path
-from fieldcal.warehouse.upgrade import upgrade
+from fieldcal.warehouse.upkeep.upgrade import upgrade
 source, folder = map(Path, sys.argv[1:3])
 replace = os.replace
 for number in range(int(sys.argv[3])):

@@ -22,7 +22,7 @@ from fieldcal.warehouse.files import file_sha256
 from fieldcal.warehouse.layout import checksum_path, history_path
 from fieldcal.warehouse.lock import vehicle_lock
 from fieldcal.warehouse.publish import publish, read_history
-from fieldcal.warehouse.verify import verify
+from fieldcal.warehouse.upkeep.verify import verify
 
 
 def stat_of(root: Path) -> dict[str, tuple[int, int]]:

@@ -18,7 +18,7 @@ from fieldcal.warehouse.layout import checksum_path, history_path, signal_path
 from fieldcal.warehouse.publish import publish
 from fieldcal.warehouse.signals import signal_writer
 from fieldcal.warehouse.stage_store import StageStore
-from fieldcal.warehouse.verify import verify
+from fieldcal.warehouse.upkeep.verify import verify
 
 
 @pytest.fixture

@@ -120,7 +120,8 @@ def _files(root: Path, job: Job, records: Mapping[str, Record]) -> Iterable[str]
             if "file" in output:
                 yield str((folder / output["file"]).relative_to(root))
     for table in records[INGEST]["signals"]:
-        yield str(signal_path(root, table, job.vehicle_id, job.flight_id).relative_to(root))
+        path = signal_path(root, table, job.vehicle_id, job.flight_id)
+        yield from (str(one.relative_to(root)) for one in (path, checksum_path(root, path)))
 
 
 def _stamps(root: Path, files: Sequence[str]) -> str:

@@ -1,0 +1,1 @@
+"""What nights remember of logs and flights, so that the next need not look."""

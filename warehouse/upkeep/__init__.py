@@ -1,0 +1,1 @@
+"""What keeps a warehouse whole, of this version, and small."""
