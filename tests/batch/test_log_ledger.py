@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from fieldcal.batch import jobs, log_ledger
+from fieldcal.batch import jobs
 from fieldcal.batch.jobs import find_jobs
+from fieldcal.batch.ledgers import logs as log_ledger
 from fieldcal.batch.ledgers.logs import read_ledger, write_ledger
 from fieldcal.config.configuration import load
 from fieldcal.flight.job import Job
