@@ -138,6 +138,27 @@ def test_colder_or_warmer_than_flown_is_told(
     assert calibrated(log_of(tmp_path, IMU, WARM), constants, follow_temperature=False).warnings == ()
 
 
+def test_one_temperature_is_enough_to_tell(tmp_path: Path) -> None:
+    one = temperature_channel(T_NS[:1], None, np.array([60.0]))
+    warnings = calibrated(log_of(tmp_path, IMU, one), flown_with()).warnings
+    assert len(warnings) == 2
+    assert all("60.0 to 60.0 °C goes beyond the 0.0 to 50.0 °C flown" in told for told in warnings)
+
+
+def test_what_an_autopilot_had_made_of_readings_is_undone(tmp_path: Path) -> None:
+    """logged = M raw + o, M with cross-axis terms and turned; a sensor of which nothing is known is as it is logged."""
+    m, o = np.array([[0.1, -1.2, 0.05], [0.9, 0.02, 0.3], [-0.2, 0.1, 1.1]]), np.array([0.4, -0.7, 0.2])
+    settings = calibrated(log_of(tmp_path, IMU), flown_with()).settings
+    settings = replace(
+        settings,
+        applied_matrix={**settings.applied_matrix, Sensor.GYROSCOPE: tuple(map(tuple, m))},
+        applied_offset={**settings.applied_offset, Sensor.GYROSCOPE: tuple(o)},
+    )
+    found = apply.raw_readings(RATE @ m.T + o, Sensor.GYROSCOPE, settings)
+    np.testing.assert_allclose(found, RATE, rtol=0, atol=EQUAL)
+    np.testing.assert_array_equal(apply.raw_readings(FORCE, Sensor.ACCELEROMETER, settings), FORCE)
+
+
 def test_sensors_without_constants_or_readings_are_left_out(tmp_path: Path) -> None:
     found = calibrated(log_of(tmp_path, IMU), flown_with(Sensor.ACCELEROMETER, Sensor.MAGNETOMETER))
     assert list(found.readings) == [Sensor.ACCELEROMETER]
