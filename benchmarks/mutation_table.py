@@ -2152,6 +2152,14 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "known = np.abs(triad.zero_per_degc) > triad.zero_per_degc_sd",
         "> → >=",
     ): _NEVER_MET,
+    ("exports.autopilots.units", "", "ROUNDING = 1e-9", "1e-09 → 1.1000000000000001e-09"): _RCOND,
+    (
+        "exports.autopilots.units",
+        "not_held",
+        "if sensor != Sensor.MAGNETOMETER and cross > ROUNDING:",
+        "> → >=",
+    ): _NEVER_MET,
+    ("exports.autopilots.units", "dropped_rotation", "if angle < LEAST_ANGLE_DEG:", "< → <="): _NEVER_MET,
     (
         "exports.kalibr",
         "lower_and_rotation",

@@ -61,11 +61,13 @@ def test_the_sd_of_zeros_and_slopes_goes_through_the_inverse(turn: np.ndarray, s
     np.testing.assert_allclose(own.zero_per_degc_sd**2, np.diagonal(inverse @ np.diag(slope_sd**2) @ inverse.T))
 
 
-def test_the_sd_of_a_scale_grows_with_the_autopilots() -> None:
-    """Quarter turns: each scale is that of one axis times the autopilot's factor of it."""
+@pytest.mark.parametrize("turn", [QUARTER_TURN, ANY_TURN])
+def test_the_sd_of_a_scale_is_that_of_the_diagonal_turned_back_and_grows_with_the_autopilots(turn: np.ndarray) -> None:
+    """(Rᵀ diag(e) R)_ii = Σ_j R_ji² e_j, e independent errors; times the autopilot's factor of the axis."""
     sd = np.array([0.1, 0.2, 0.4])
-    own = of_raw(found(scale=sd), QUARTER_TURN @ DIAGONAL, np.zeros(3), None)
-    np.testing.assert_allclose(own.scale_sd, np.abs(QUARTER_TURN).T @ sd * np.diagonal(DIAGONAL))
+    own = of_raw(found(scale=sd), turn @ DIAGONAL, np.zeros(3), None)
+    variances = np.diagonal(DIAGONAL) ** 2 * sum(turn[j] ** 4 * sd[j] ** 2 for j in range(3))
+    np.testing.assert_allclose(own.scale_sd**2, variances)
 
 
 @pytest.mark.parametrize("axis", [*np.eye(3), [1.0, -2.0, 0.5], [-0.3, 0.4, 2.0]])

@@ -98,7 +98,7 @@ def constants(autopilot: str | None = None, more: dict[str, float] | None = None
     [(sensor, one, other) for sensor, one in IN_AUTOPILOT_UNITS for of, other in IN_AUTOPILOT_UNITS if of == sensor],
 )
 def test_units_are_converted_before_or_after(sensor: Sensor, logged_unit: str, unit: str, magnetic_unit: float) -> None:
-    """Calibrating and then converting is converting and then calibrating, at every temperature."""
+    """Calibrating and then converting is converting and then calibrating, at every temperature; shares of sd stay."""
     rng = np.random.default_rng(5)
     of, to = (
         IN_AUTOPILOT_UNITS[sensor, u] / (magnetic_unit if sensor == Sensor.MAGNETOMETER else 1.0)
@@ -113,11 +113,26 @@ def test_units_are_converted_before_or_after(sensor: Sensor, logged_unit: str, u
         zero_per_degc=0.1 * rng.normal(size=3),
         zero_per_degc2=0.01 * rng.normal(size=3),
         zero_per_degc3=0.001 * rng.normal(size=3),
+        scale_sd=rng.uniform(0.1, 1.0, 3),
+        zero_sd=rng.uniform(0.1, 1.0, 3),
+        zero_per_degc_sd=rng.uniform(0.1, 1.0, 3),
     )
     raw, warm = rng.normal(size=(50, 3)), rng.uniform(-10.0, 50.0, 50)
     found = in_autopilot_units(sensor, given, magnetic_unit)
     assert isinstance(found, Triad)
     np.testing.assert_allclose(found.apply(raw * of, warm), given.apply(raw, warm) * to, rtol=1e-9, atol=0)
+    np.testing.assert_allclose(found.scale_sd * np.diagonal(given.scale), given.scale_sd * np.diagonal(found.scale))
+    np.testing.assert_allclose(found.zero_sd * given.zero, given.zero_sd * found.zero)
+    np.testing.assert_allclose(
+        found.zero_per_degc_sd * given.zero_per_degc, given.zero_per_degc_sd * found.zero_per_degc
+    )
+
+
+@pytest.mark.parametrize(("logged_unit", "unit", "named"), [("counts", "G", "counts"), ("G", "norm", "norm")])
+def test_a_unit_that_no_autopilot_has_is_named(logged_unit: str, unit: str, named: str) -> None:
+    why = in_autopilot_units(Sensor.MAGNETOMETER, triad(unit, logged_unit), 1.0)
+    assert isinstance(why, str)
+    assert why.startswith(f"Its constants are in {named};")
 
 
 @pytest.mark.parametrize("write", [px4, ardupilot])
@@ -164,7 +179,7 @@ def test_a_slope_of_one_axis_scale_is_told(sensor: Sensor) -> None:
     )
 
 
-@pytest.mark.parametrize(("angle", "told"), [(0.0, False), (0.9e-6, False), (1.1e-6, True), (3.0, True)])
+@pytest.mark.parametrize(("angle", "told"), [(0.0, False), (0.9e-6, False), (1.05e-6, True), (3.0, True)])
 def test_the_nearest_symmetric_matrix_keeps_lengths_and_the_rotation_is_told(angle: float, told: bool) -> None:
     turn = Rotation.from_rotvec([0.0, np.deg2rad(angle), 0.0]).as_matrix()
     soft = np.array([[1.02, 0.01, -0.02], [0.01, 0.97, 0.03], [-0.02, 0.03, 1.01]])
