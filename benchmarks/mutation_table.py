@@ -2161,6 +2161,12 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): _NEVER_MET,
     ("exports.autopilots.units", "dropped_rotation", "if angle < LEAST_ANGLE_DEG:", "< → <="): _NEVER_MET,
     (
+        "exports.handed_out",
+        "_became",
+        'same=(pl.col("set_to") - pl.col("exported")).abs()',
+        "<= → <",
+    ): _NEVER_MET,
+    (
         "exports.kalibr",
         "lower_and_rotation",
         "return np.asarray(lower * signs), np.asarray(signs[:, None] * turn)",
