@@ -2161,6 +2161,12 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): _NEVER_MET,
     ("exports.autopilots.units", "dropped_rotation", "if angle < LEAST_ANGLE_DEG:", "< → <="): _NEVER_MET,
     (
+        "exports.calibration_at",
+        "_constants",
+        'ids = {s: str(rows.filter(sensor=s)["unit_id"][0]) for s in triads}',
+        "0 → 1",
+    ): "the rows of a sensor are one unit's",
+    (
         "exports.handed_out",
         "_became",
         'same=(pl.col("set_to") - pl.col("exported")).abs()',

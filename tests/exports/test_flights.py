@@ -54,6 +54,11 @@ def test_one_unit_that_is_asked_for_comes_alone(tmp_path: Path) -> None:
     constants = constants_of(two_units(tmp_path), "v", unit_id="b/11")
     assert constants.further == ()
     assert "CAL_GYRO1" not in fieldcal.export(constants, "px4").text
+    with pytest.raises(
+        fieldcal.FieldcalError, match="'v' is known of unit 'b/9'; there is: b/10, b/11, b/12"
+    ) as caught:
+        constants_of(tmp_path, "v", unit_id="b/9")
+    assert caught.value.reason_code == "no_calibration"
 
 
 @pytest.mark.parametrize("day", [0, None])
@@ -70,7 +75,7 @@ def test_what_was_loaded_is_that_of_the_latest_flight_behind_any_constant(tmp_pa
     )
     constants = constants_of(root, "v")
     assert constants.triads[Sensor.GYROSCOPE].zero.tolist() == [0.05, 0.1, 0.1]
-    assert constants.imu_rate_hz == 187.0
+    assert (constants.imu_rate_hz, constants.as_of) == (187.0, new["started_at"].isoformat())
     loaded = constants.origins[Sensor.GYROSCOPE].loaded
     assert loaded is not None
     assert loaded.parameters == now
