@@ -2173,6 +2173,12 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "<= → <",
     ): _NEVER_MET,
     (
+        "exports.json_document",
+        "json_document",
+        'return Export(json.dumps(document, ensure_ascii=False, indent=1, allow_nan=False) + "\\n", ())',
+        "1 → 2",
+    ): "white space of JSON means nothing",
+    (
         "exports.kalibr",
         "lower_and_rotation",
         "return np.asarray(lower * signs), np.asarray(signs[:, None] * turn)",
