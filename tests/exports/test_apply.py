@@ -226,6 +226,23 @@ def test_only_what_the_log_holds_is_written(
         assert len(list(messages_by_mcap_ros2(path, topic))) == (count if topic in topics else 0)
 
 
+@pytest.mark.parametrize(("unit", "tesla"), [("T", 1.0), ("G", 1e-4), ("uT", 1e-6), ("norm", None)])
+def test_ros_gets_tesla_or_another_topic(tmp_path: Path, unit: str, tesla: float | None) -> None:
+    """Parts of a field whose strength is not known are no tesla: they are as they are, under another name."""
+    found = calibrated(log_of(tmp_path, IMU, MAG), flown_with(Sensor.MAGNETOMETER, unit=unit))
+    told = calibrated_files.write_ros(found, tmp_path / "out.mcap")
+    assert [one.endswith("is not in tesla.") for one in told] == ([True] if tesla is None else [])
+    topic = "/imu/mag_norm" if tesla is None else "/imu/mag"
+    messages = [m.magnetic_field for _, m in messages_by_mcap_ros2(tmp_path / "out.mcap", topic)]
+    field = np.array([[v.x, v.y, v.z] for v in messages])
+    np.testing.assert_allclose(field, (tesla or 1.0) * found.readings[Sensor.MAGNETOMETER][1], rtol=1e-12)
+
+
+def test_a_table_without_temperatures_has_no_column_for_them(tmp_path: Path) -> None:
+    calibrated(log_of(tmp_path, IMU), flown_with()).write(tmp_path / "out.csv")
+    assert (tmp_path / "out.csv").read_text().splitlines()[0] == "t_s,gx,gy,gz,ax,ay,az"
+
+
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_one_table_of_all_readings_by_the_names_ending(tmp_path: Path, ending: str) -> None:
     """A row a stamp of any sensor; the magnetometer is at every second, temperatures between."""
