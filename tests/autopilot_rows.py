@@ -57,7 +57,7 @@ def history(root: Path, *flights: tuple[list[dict[str, Any]], list[dict[str, Any
         tables = {
             "calibration": rows("calibration", *constants),
             "run": rows("run", *runs),
-            "flight": rows("flight", {**runs[0], "log_uri": "x", "verdict": "ok", "imu_rate_hz": 187.0}),
+            "flight": rows("flight", {"imu_rate_hz": 187.0, **runs[0], "log_uri": "x", "verdict": "ok"}),
         }
         publish(root, "v", tables, [runs[0]["flight_id"]])
     return root

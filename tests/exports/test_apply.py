@@ -138,6 +138,27 @@ def test_colder_or_warmer_than_flown_is_told(
     assert calibrated(log_of(tmp_path, IMU, WARM), constants, follow_temperature=False).warnings == ()
 
 
+def test_one_temperature_is_enough_to_tell(tmp_path: Path) -> None:
+    one = temperature_channel(T_NS[:1], None, np.array([60.0]))
+    warnings = calibrated(log_of(tmp_path, IMU, one), flown_with()).warnings
+    assert len(warnings) == 2
+    assert all("60.0 to 60.0 °C goes beyond the 0.0 to 50.0 °C flown" in told for told in warnings)
+
+
+def test_what_an_autopilot_had_made_of_readings_is_undone(tmp_path: Path) -> None:
+    """logged = M raw + o, M with cross-axis terms and turned; a sensor of which nothing is known is as it is logged."""
+    m, o = np.array([[0.1, -1.2, 0.05], [0.9, 0.02, 0.3], [-0.2, 0.1, 1.1]]), np.array([0.4, -0.7, 0.2])
+    settings = calibrated(log_of(tmp_path, IMU), flown_with()).settings
+    settings = replace(
+        settings,
+        applied_matrix={**settings.applied_matrix, Sensor.GYROSCOPE: tuple(map(tuple, m))},
+        applied_offset={**settings.applied_offset, Sensor.GYROSCOPE: tuple(o)},
+    )
+    found = apply.raw_readings(RATE @ m.T + o, Sensor.GYROSCOPE, settings)
+    np.testing.assert_allclose(found, RATE, rtol=0, atol=EQUAL)
+    np.testing.assert_array_equal(apply.raw_readings(FORCE, Sensor.ACCELEROMETER, settings), FORCE)
+
+
 def test_sensors_without_constants_or_readings_are_left_out(tmp_path: Path) -> None:
     found = calibrated(log_of(tmp_path, IMU), flown_with(Sensor.ACCELEROMETER, Sensor.MAGNETOMETER))
     assert list(found.readings) == [Sensor.ACCELEROMETER]
@@ -203,6 +224,23 @@ def test_only_what_the_log_holds_is_written(
     rows = {"/imu/data": SAMPLES, "/imu/mag": SAMPLES // 2, "/imu/temperature": len(WARM_T_NS)}
     for topic, count in rows.items():
         assert len(list(messages_by_mcap_ros2(path, topic))) == (count if topic in topics else 0)
+
+
+@pytest.mark.parametrize(("unit", "tesla"), [("T", 1.0), ("G", 1e-4), ("uT", 1e-6), ("norm", None)])
+def test_ros_gets_tesla_or_another_topic(tmp_path: Path, unit: str, tesla: float | None) -> None:
+    """Parts of a field whose strength is not known are no tesla: they are as they are, under another name."""
+    found = calibrated(log_of(tmp_path, IMU, MAG), flown_with(Sensor.MAGNETOMETER, unit=unit))
+    told = calibrated_files.write_ros(found, tmp_path / "out.mcap")
+    assert [one.endswith("is not in tesla.") for one in told] == ([True] if tesla is None else [])
+    topic = "/imu/mag_norm" if tesla is None else "/imu/mag"
+    messages = [m.magnetic_field for _, m in messages_by_mcap_ros2(tmp_path / "out.mcap", topic)]
+    field = np.array([[v.x, v.y, v.z] for v in messages])
+    np.testing.assert_allclose(field, (tesla or 1.0) * found.readings[Sensor.MAGNETOMETER][1], rtol=1e-12)
+
+
+def test_a_table_without_temperatures_has_no_column_for_them(tmp_path: Path) -> None:
+    calibrated(log_of(tmp_path, IMU), flown_with()).write(tmp_path / "out.csv")
+    assert (tmp_path / "out.csv").read_text().splitlines()[0] == "t_s,gx,gy,gz,ax,ay,az"
 
 
 @pytest.mark.parametrize("ending", ["csv", "parquet"])

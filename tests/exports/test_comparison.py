@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.constants
+from scipy.spatial.transform import Rotation
 
 import fieldcal
 from fieldcal.config.loaded import Autopilot, Loaded
@@ -85,6 +87,28 @@ def test_ardupilots_in_gauss_with_our_sign() -> None:
     assert (x.name, x.unit) == ("COMPASS_OFS_X", "G")
     assert (x.flies_with, x.estimate) == (pytest.approx(0.05), pytest.approx(0.03))
     assert row(c, "x", "scale").flies_with == pytest.approx(1.1)
+    assert row(c, "y", "zero").flies_with == 0.0  # what is not told has its default
+
+
+def test_a_compass_that_is_turned_before_it_is_corrected_flies_with_its_parameters() -> None:
+    """The axes of both are the body's, whatever COMPASS_ORIENT says of an external one (6: by 270°)."""
+    loaded = {"COMPASS_DEV_ID": 3.0, "COMPASS_EXTERNAL": 1.0, "COMPASS_ORIENT": 6.0, "AHRS_ORIENTATION": 2.0}
+    loaded |= {f"COMPASS_DIA_{axis}": value for axis, value in zip("XYZ", (1.1, 0.9, 1.05), strict=True)}
+    loaded |= {f"COMPASS_OFS_{axis}": value for axis, value in zip("XYZ", (10.0, 20.0, -30.0), strict=True)}
+    c = constants(Sensor.MAGNETOMETER, "ardupilot", loaded)
+    assert [row(c, axis, "scale").flies_with for axis in "xyz"] == pytest.approx([1.1, 0.9, 1.05])
+    assert [row(c, axis, "zero").flies_with for axis in "xyz"] == pytest.approx([-0.01, -0.02, 0.03])
+
+
+def test_of_a_matrix_that_is_not_symmetric_what_can_be_loaded_is_compared() -> None:
+    """A magnetometer's is the symmetric one with the same lengths; the others have a factor an axis."""
+    turn = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
+    soft = np.array([[1.02, 0.01, -0.02], [0.01, 0.97, 0.03], [-0.02, 0.03, 1.01]])
+    for sensor, name in ((Sensor.MAGNETOMETER, "CAL_MAG0_ID"), (Sensor.ACCELEROMETER, "CAL_ACC0_ID")):
+        c = constants(sensor, "px4", {name: float(IDS[sensor])})
+        c = replace(c, triads={sensor: replace(c.triads[sensor], scale=turn @ soft)})
+        wanted = np.diagonal(soft if sensor == Sensor.MAGNETOMETER else turn @ soft)
+        assert [row(c, axis, "scale").estimate for axis in "xyz"] == pytest.approx(list(wanted))
 
 
 def test_what_flies_has_its_compensation_of_temperature_in_it() -> None:
@@ -97,10 +121,32 @@ def test_what_flies_has_its_compensation_of_temperature_in_it() -> None:
     assert row(c, "x", "zero").flies_with == pytest.approx(0.007)
 
 
+@pytest.mark.parametrize("loaded", [0.0, 0.3])
 @pytest.mark.parametrize(("sd", "matters"), [(1e-5, True), (0.0049, True), (0.0051, False), (np.nan, True)])
-def test_a_difference_within_its_sd_does_not_matter(sd: float, matters: bool) -> None:
-    c = constants(Sensor.GYROSCOPE, "px4", {"CAL_GYRO0_ID": 1.0}, zero=(0.01, 0.0, 0.0), sd=sd)
+def test_a_difference_within_its_sd_does_not_matter(sd: float, matters: bool, loaded: float) -> None:
+    parameters = {"CAL_GYRO0_ID": 1.0, "CAL_GYRO0_XOFF": loaded}
+    c = constants(Sensor.GYROSCOPE, "px4", parameters, zero=(loaded + 0.01, 0.0, 0.0), sd=sd)
     assert row(c, "x", "zero").matters == matters
+
+
+@pytest.mark.parametrize(
+    ("sensor", "parameter", "limit", "by_unit"),
+    [
+        (Sensor.GYROSCOPE, "zero", 5.0, np.deg2rad(1.0 / 60.0)),
+        (Sensor.GYROSCOPE, "scale", 3.0, 1.0 / 360.0),
+        (Sensor.ACCELEROMETER, "zero", 5.0, 1e-3 * scipy.constants.g),
+        (Sensor.ACCELEROMETER, "scale", 5.0, 1e-3),
+        (Sensor.MAGNETOMETER, "scale", 1.0, 2.0 * np.deg2rad(1.0)),
+    ],
+)
+def test_what_is_worth_a_change(sensor: Sensor, parameter: str, limit: float, by_unit: float) -> None:
+    """5° in a minute, 3° in a full turn, 5 mg, 1° of heading, as the guide on autopilots says."""
+    name = {"gyroscope": "CAL_GYRO0_ID", "accelerometer": "CAL_ACC0_ID", "magnetometer": "CAL_MAG0_ID"}[sensor]
+    for share in (0.99, 1.01):
+        off = share * limit * by_unit
+        own = {"zero": (off, 0.0, 0.0)} if parameter == "zero" else {"scale": (1.0 + off, 1.0, 1.0)}
+        found = row(constants(sensor, "px4", {name: float(IDS[sensor])}, **own), "x", parameter)
+        assert (found.effect, found.matters) == (pytest.approx(share * limit), share > 1.0)
 
 
 def test_the_table_has_a_cell_a_column() -> None:
@@ -118,6 +164,13 @@ def test_the_table_has_a_cell_a_column() -> None:
         "CAL_GYRO0_XOFF",
         "yes",
     ]
+
+
+@pytest.mark.parametrize(("off", "shown"), [(-0.0123456, ("-0.0123", "42.4 ° in 60 s")), (1e-14, ("0", "0 ° in 60 s"))])
+def test_a_difference_is_shown_with_three_digits_and_rounding_as_none(off: float, shown: tuple[str, str]) -> None:
+    loaded = {"CAL_GYRO0_ID": 1.0, "CAL_GYRO0_XOFF": 0.5}
+    cells = lines(fieldcal.compare(constants(Sensor.GYROSCOPE, "px4", loaded, zero=(0.5 + off, 0.0, 0.0))))[0]
+    assert (cells[5].replace("−", "-"), cells[6]) == shown
 
 
 def test_without_parameters_there_is_nothing_to_compare_with() -> None:

@@ -88,6 +88,38 @@ def test_no_slope_no_range(tmp_path: Path) -> None:
     t = constants_of(warehouse(tmp_path, flight(lead("v", "f1"))), "v").triads[Sensor.GYROSCOPE]
     assert (t.flown_degc, t.unit, t.logged_unit) == (None, "rad/s", "counts")
     np.testing.assert_array_equal(t.scale, np.diag([2.0, 2.01, 2.02]))
+    for slope in (t.scale_per_degc, t.zero_per_degc, t.zero_per_degc2, t.zero_per_degc3):
+        assert not np.any(slope)
+    np.testing.assert_array_equal(t.zero_per_degc_sd, np.full(3, np.inf))
+
+
+def test_how_well_a_slope_is_known(tmp_path: Path) -> None:
+    """A slope without sd is taken as it is; where there is none, nothing is known of it."""
+    x, y, z = trend(lead("v", "f1"))
+    drift = [x, y | {"slope_per_degc_sd": None}, z | dict.fromkeys(("slope_per_degc", "slope_per_degc_sd"))]
+    t = constants_of(warehouse(tmp_path, flight(lead("v", "f1")), drift=drift), "v").triads[Sensor.GYROSCOPE]
+    np.testing.assert_array_equal(t.zero_per_degc_sd, [0.001, 0.0, np.inf])
+    np.testing.assert_array_equal(t.zero_per_degc, [SLOPES["x"], SLOPES["y"], 0.0])
+    assert t.flown_degc == (3.0, 39.0)
+
+
+def test_an_sd_that_is_not_known_is_none(tmp_path: Path) -> None:
+    records = [{**r, "sd": None if r["axis"] == "y" else r["sd"]} for r in flight(lead("v", "f1"))]
+    t = constants_of(warehouse(tmp_path, records), "v").triads[Sensor.GYROSCOPE]
+    for sd in (t.scale_sd, t.zero_sd):
+        np.testing.assert_array_equal(sd, [0.1, np.nan, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("scale", "logged", "unit"),
+    [("rad/s/counts", "counts", "rad/s"), ("rad/s/(deg/s)", "deg/s", "rad/s"), ("1", "deg/s", "deg/s")],
+)
+def test_the_unit_of_the_result_is_that_of_the_scale_times_the_logged_one(
+    tmp_path: Path, scale: str, logged: str, unit: str
+) -> None:
+    records = [{**r, "unit": scale if r["parameter"] == "scale" else logged} for r in flight(lead("v", "f1"))]
+    t = constants_of(warehouse(tmp_path, records), "v").triads[Sensor.GYROSCOPE]
+    assert (t.unit, t.logged_unit) == (unit, logged)
 
 
 def test_a_full_matrix_is_one_flights(tmp_path: Path) -> None:

@@ -141,6 +141,18 @@ def test_kalibr_reads_the_file_and_its_model_gives_the_readings() -> None:
     assert any("noise densities" in warning for warning in written.warnings)
 
 
+def test_kalibrs_file_has_the_noise_of_its_documentation_and_says_so() -> None:
+    """The example of Kalibr's page on YAML formats: an ADIS16448 at 200 Hz."""
+    c = constants(gyroscope=triad("gyroscope"))
+    written = export("kalibr", c)
+    imu = yaml.safe_load(written.text)
+    assert (imu["accelerometer_noise_density"], imu["accelerometer_random_walk"]) == (0.01, 0.0002)
+    assert (imu["gyroscope_noise_density"], imu["gyroscope_random_walk"]) == (0.005, 4.0e-06)
+    assert imu["update_rate"] == 200.0
+    assert any("rate of the readings is not known" in told for told in written.warnings)
+    assert not any("rate of" in told for told in export("kalibr", replace(c, imu_rate_hz=200.0)).warnings)
+
+
 def test_imu_calibs_file_gives_what_apply_gives() -> None:
     """AccelCalib::loadCalib and applyCalib of imu_calib: corrected = SM · raw − bias, SM row by row."""
     t = triad("accelerometer", soft_iron=True)
@@ -149,7 +161,10 @@ def test_imu_calibs_file_gives_what_apply_gives() -> None:
     assert (len(node["SM"]), len(node["bias"])) == (9, 3)
     corrected = RAW["accelerometer"] @ np.array(node["SM"]).reshape(3, 3).T - np.array(node["bias"])
     assert same(corrected, t.apply(RAW["accelerometer"]))
-    assert any(told.startswith("gyroscope: imu_calib measures its zero itself") for told in written.warnings)
+    assert [told.partition(":")[0] for told in written.warnings] == ["gyroscope"]
+    assert written.warnings[0].startswith("gyroscope: imu_calib measures its zero itself")
+    written = export("imu_calib", constants(accelerometer=t, magnetometer=triad("magnetometer")))
+    assert written.warnings == ("magnetometer: imu_calib has none; left out.",)
     for other in ({"gyroscope": triad("gyroscope")}, {"accelerometer": replace(t, logged_unit="counts")}):
         with pytest.raises(FieldcalError, match="imu_calib corrects an accelerometer in m/s²") as caught:
             export("imu_calib", constants(**other))

@@ -54,6 +54,54 @@ def test_one_unit_that_is_asked_for_comes_alone(tmp_path: Path) -> None:
     constants = constants_of(two_units(tmp_path), "v", unit_id="b/11")
     assert constants.further == ()
     assert "CAL_GYRO1" not in fieldcal.export(constants, "px4").text
+    with pytest.raises(
+        fieldcal.FieldcalError, match="'v' is known of unit 'b/9'; there is: b/10, b/11, b/12"
+    ) as caught:
+        constants_of(tmp_path, "v", unit_id="b/9")
+    assert caught.value.reason_code == "no_calibration"
+
+
+@pytest.mark.parametrize("day", [0, None])
+def test_what_was_loaded_is_that_of_the_latest_flight_behind_any_constant(tmp_path: Path, day: int | None) -> None:
+    """One axis is of a later flight than the others; a flight whose clock is unknown counts as older."""
+    old, new = (lead("v", name, when) | {"unit_id": "b/12"} for name, when in (("f9", day), ("f1", 1)))
+    old["imu_rate_hz"] = 400.0
+    one_axis = [r for r in gyroscope(new, 0.05) if (r["parameter"], r["axis"]) == ("zero", "x")]
+    now = PARAMETERS | {"CAL_GYRO1_XOFF": 0.25}
+    root = history(
+        tmp_path,
+        (gyroscope(old, 0.1), [composition(old, origin(12))]),
+        (one_axis, [composition(new, origin(12, now))]),
+    )
+    constants = constants_of(root, "v")
+    assert constants.triads[Sensor.GYROSCOPE].zero.tolist() == [0.05, 0.1, 0.1]
+    assert (constants.imu_rate_hz, constants.as_of) == (187.0, new["started_at"].isoformat())
+    loaded = constants.origins[Sensor.GYROSCOPE].loaded
+    assert loaded is not None
+    assert loaded.parameters == now
+
+
+def test_the_temperature_is_that_of_the_units_own_zero(tmp_path: Path) -> None:
+    primary = lead("v", "f1", 1) | {"unit_id": "b/12"}
+    other = lead("v", "f1", 1) | {"unit_id": "b/11", "is_primary": False}
+    warm = {("b/12", "zero"): 31.0, ("b/12", "scale"): 20.0, ("b/11", "zero"): 45.0, ("b/11", "scale"): 50.0}
+    constants = [
+        row | {"temperature_degc": warm[row["unit_id"], row["parameter"]]}
+        for row in gyroscope(primary, 0.03) + gyroscope(other, 0.04)
+    ]
+    found = constants_of(history(tmp_path, (constants, [composition(primary, origin(12))])), "v")
+    assert found.origins[Sensor.GYROSCOPE].temperature_degc == 31.0
+
+
+def test_units_beside_are_those_of_the_latest_flight_whose_clock_is_known(tmp_path: Path) -> None:
+    flights = []
+    for name, day, beside in (("f9", None, 11), ("f1", 1, 13)):
+        primary = lead("v", name, day) | {"unit_id": "b/12"}
+        other = lead("v", name, day) | {"unit_id": f"b/{beside}", "is_primary": False}
+        runs = [composition(primary, origin(12)), composition(other, origin(beside))]
+        flights.append((gyroscope(primary, 0.03) + gyroscope(other, 0.04), runs))
+    (beside,) = constants_of(history(tmp_path, *flights), "v").further
+    assert beside.unit_ids == {"gyroscope": "b/13"}
 
 
 def test_a_history_of_before_tells_nothing(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from history_rows import START, lead
 
 import fieldcal
 from fieldcal.cli.main import run
+from fieldcal.exports.calibration import Constants, Export, Written
 from fieldcal.exports.handed_out import Fate, HandedOut, handed_out, record_export
 from fieldcal.report import write_vehicle_report
 from fieldcal.warehouse import Warehouse
@@ -77,6 +78,41 @@ def test_the_same_export_again_is_none(root: Path) -> None:
     assert became(root).format == "px4"  # of others no log tells
 
 
+def one_number(root: Path, *numbers: Written, at: dt.datetime = EXPORTED) -> bool:
+    """Remember an export whose text is its numbers."""
+    export = Export(" ".join(f"{one.name}={one.value}" for one in numbers), (), numbers)
+    constants = Constants("v", "i", {}, "")
+    return record_export(root, constants, "px4", export, author="ann", at_degc=25.0, now=at)
+
+
+def test_only_a_repetition_of_the_last_export_is_none(root: Path) -> None:
+    exports = [Written("b/12", "gyroscope", "CAL_GYRO1_XOFF", value) for value in (0.1, 0.2, 0.1, 0.1)]
+    told = [one_number(root, one, at=EXPORTED + dt.timedelta(hours=i)) for i, one in enumerate(exports)]
+    assert told == [True, True, True, False]
+
+
+def test_the_latest_flight_is_the_last_one_whose_clock_is_known(root: Path) -> None:
+    put(root, 7, PARAMETERS, dated=False)
+    one_number(root, Written("b/12", "gyroscope", "CAL_GYRO1_XOFF", 0.03))
+    assert set(Warehouse(root).scan("export").collect()["latest_flight_id"]) == {"f1"}
+
+
+def test_what_became_is_told_by_sensor_and_unit(root: Path) -> None:
+    own = [("gyroscope", f"b/{unit}") for unit in range(10, 20)] + [("accelerometer", f"b/{unit}") for unit in (11, 10)]
+    one_number(root, *(Written(unit, sensor, f"P{i}", 1.0) for i, (sensor, unit) in enumerate(reversed(own))))
+    assert [(one.sensor, one.unit_id) for one in handed_out(root, "v")] == sorted(own)
+
+
+@pytest.mark.parametrize("value", [0.03, 0.0])
+@pytest.mark.parametrize(("share", "fate"), [(0.9, Fate.FLIES), (1.1, Fate.NOT_LOADED)])
+def test_a_hundred_thousandth_is_the_same_number(root: Path, value: float, share: float, fate: Fate) -> None:
+    """Float32 has seven digits, and a ground station may write six; zero is zero to a hundred thousandth of that."""
+    one_number(root, Written("b/12", "gyroscope", "CAL_GYRO1_XOFF", value))
+    off = share * 1e-5 * (value or 1e-5)
+    put(root, 2, PARAMETERS | {"CAL_GYRO1_XOFF": value + off})
+    assert became(root).fate == fate
+
+
 def test_loaded_since_and_still_flies(root: Path) -> None:
     parameters = exported(root)
     put(root, 2, PARAMETERS)
@@ -115,9 +151,16 @@ def test_flights_since_without_it(root: Path) -> None:
     assert one.differs == "CAL_GYRO1_XOFF is 0.5, not 0.03"
 
 
-def test_a_flight_of_before_that_comes_late_says_nothing(root: Path) -> None:
+def test_what_flew_before_it_was_exported_flies_since_the_first_flight(root: Path) -> None:
+    one_number(root, Written("b/12", "gyroscope", "CAL_GYRO1_XOFF", PARAMETERS["CAL_GYRO1_XOFF"]))
+    one = became(root)
+    assert (one.fate, one.since, one.until) == (Fate.FLIES, "f0", "f1")
+
+
+@pytest.mark.parametrize("hours", [1, 0])
+def test_a_flight_of_before_that_comes_late_says_nothing(root: Path, hours: int) -> None:
     exported(root)
-    first = lead("v", "late", 0) | {"unit_id": "b/12", "started_at": EXPORTED - dt.timedelta(hours=1)}
+    first = lead("v", "late", 0) | {"unit_id": "b/12", "started_at": EXPORTED - dt.timedelta(hours=hours)}
     history(root, (gyroscope(first, 0.03), [composition(first, origin(12, PARAMETERS))]))
     assert became(root).fate == Fate.NOT_KNOWN
 
@@ -134,6 +177,21 @@ def test_without_a_clock_flights_are_known_by_their_order(tmp_path: Path) -> Non
         Fate.FLIES,
         "gyroscope: exported for px4 on 2026-05-05; loaded since flight f3, and still flies.",
     )
+
+
+def test_a_flight_whose_clock_is_unknown_is_not_the_latest_one(root: Path) -> None:
+    one_number(root, Written("b/12", "gyroscope", "CAL_GYRO1_XOFF", 0.03))
+    put(root, 2, PARAMETERS | {"CAL_GYRO1_XOFF": 0.03}, dated=False)
+    assert (became(root).fate, became(root).since) == (Fate.REPLACED, "f2")
+
+
+def test_flights_count_where_the_one_before_the_export_tells_nothing(tmp_path: Path) -> None:
+    first = lead("v", "f0", None) | {"unit_id": "b/12", "sequence": "0000", "dated_by": "name"}
+    history(tmp_path, (gyroscope(first, 0.03), [composition(first, None)]))
+    one_number(tmp_path, Written("b/12", "gyroscope", "CAL_GYRO1_XOFF", 0.03))
+    assert became(tmp_path).fate == Fate.NOT_KNOWN
+    put(tmp_path, 1, PARAMETERS, dated=False)
+    assert (became(tmp_path).fate, became(tmp_path).differs) == (Fate.NOT_LOADED, "CAL_GYRO1_XOFF is 0.5, not 0.03")
 
 
 def test_the_latest_export_is_what_is_told(root: Path) -> None:

@@ -14,8 +14,10 @@ from fieldcal.cli.main import run
 from fieldcal.config.loaded import Autopilot, Loaded
 from fieldcal.errors import FieldcalError
 from fieldcal.exports import AUTOPILOTS
+from fieldcal.exports.autopilots.ardupilot_slot import ArduPilot
 from fieldcal.exports.autopilots.loading import Request
 from fieldcal.exports.autopilots.parameter_file import read_parameters
+from fieldcal.exports.autopilots.px4_slot import signed, thermal_slot
 from fieldcal.exports.calibration import NOT_TURNED, Constants, Origin, Triad
 from fieldcal.names import SENSORS, Sensor
 
@@ -114,6 +116,14 @@ def test_a_sensor_that_is_mounted_turned_is_calibrated_in_its_own_axes() -> None
     np.testing.assert_allclose([a[f"COMPASS_OFS_{axis}"] for axis in "XYZ"], wanted)
 
 
+@pytest.mark.parametrize(("angle", "counts"), [(0.0099, False), (0.0101, True)])
+def test_a_mounting_within_a_hundredth_of_a_degree_is_none(angle: float, counts: bool) -> None:
+    yaw = Rotation.from_euler("z", angle, degrees=True).as_matrix()
+    turned = constants(Origin(rotation_body_from_sensor=tuple(map(tuple, yaw))), Sensor.GYROSCOPE)
+    told = AUTOPILOTS["px4"](turned, Request(logged_raw=True)).warnings
+    assert any("it is mounted turned" in one for one in told) == counts
+
+
 def test_the_log_turns_constants_back_by_its_mounting() -> None:
     yaw = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
     loaded = Loaded("px4", 7, tuple(map(tuple, yaw)), {"CAL_ACC2_ID": 7.0})
@@ -153,8 +163,8 @@ def test_without_a_device_id_the_only_slot_is_taken_or_none() -> None:
     own = constants(Origin(), Sensor.GYROSCOPE)
     p = px4(own, parameters={"CAL_GYRO2_ID": 5.0, "CAL_GYRO2_XOFF": 0.1})
     np.testing.assert_allclose(of(p, "CAL_GYRO2_", "OFF"), ZERO[Sensor.GYROSCOPE] + [0.1, 0.0, 0.0])
-    for several in ({}, {"CAL_GYRO0_ID": 5.0, "CAL_GYRO1_ID": 6.0}):
-        with pytest.raises(FieldcalError, match="there is not one device"):
+    for several, there in (({}, "none"), ({"CAL_GYRO0_ID": 5.0, "CAL_GYRO1_ID": 6.0}, "5, 6")):
+        with pytest.raises(FieldcalError, match=rf"there is not one device \({there}\)"):
             px4(own, parameters=several)
     p = px4(own, parameters={"CAL_GYRO2_ID": 5.0, "CAL_GYRO2_XOFF": 0.1}, logged_raw=True)
     np.testing.assert_allclose(of(p, "CAL_GYRO2_", "OFF"), ZERO[Sensor.GYROSCOPE])
@@ -185,6 +195,55 @@ def test_a_log_of_another_autopilot_needs_a_statement() -> None:
         with pytest.raises(FieldcalError, match="one of another autopilot than PX4"):
             px4(own, **request)
     np.testing.assert_allclose(of(px4(own, logged_raw=True), "CAL_GYRO0_", "OFF"), ZERO[Sensor.GYROSCOPE])
+
+
+@pytest.mark.parametrize(
+    ("sensor", "ids", "beyond"),
+    [
+        (Sensor.GYROSCOPE, ["INS_GYR_ID", "INS_GYR2_ID", "INS_GYR3_ID", "INS4_GYR_ID", "INS5_GYR_ID"], "INS6_GYR_ID"),
+        (
+            Sensor.ACCELEROMETER,
+            ["INS_ACC_ID", "INS_ACC2_ID", "INS_ACC3_ID", "INS4_ACC_ID", "INS5_ACC_ID"],
+            "INS6_ACC_ID",
+        ),
+        (Sensor.MAGNETOMETER, ["COMPASS_DEV_ID", "COMPASS_DEV_ID2", "COMPASS_DEV_ID3"], "COMPASS_DEV_ID4"),
+    ],
+)
+def test_ardupilot_has_five_inertial_slots_and_three_of_compasses(sensor: Sensor, ids: list[str], beyond: str) -> None:
+    """COMPASS_DEV_ID4 and on tell of further compasses that were found: they have no calibration."""
+    parameters = {name: 100.0 + i for i, name in enumerate([*ids, beyond])}
+    assert ArduPilot().devices(sensor, parameters) == {i: 100 + i for i in range(len(ids))}
+    assert ArduPilot().slot(sensor, 100 + len(ids), parameters) is None
+
+
+@pytest.mark.parametrize(
+    ("others", "wanted"),
+    [({}, 2), ({2: 9.0}, 0), ({2: 9.0, 0: 8.0}, 1), ({1: 7.0}, 1), ({0: 5.0, 1: 6.0, 2: 8.0, 3: 9.0}, None)],
+)
+def test_a_thermal_slot_of_px4_is_the_devices_else_a_free_one(others: dict[int, float], wanted: int | None) -> None:
+    """Device 7 is calibrated in slot 2; PX4 finds a thermal slot by its ID, which must be nobody else's."""
+    parameters = {"CAL_ACC2_ID": 7.0, "TC_A_ENABLE": 0.0, **{f"TC_A{slot}_ID": n for slot, n in others.items()}}
+    assert thermal_slot(Sensor.ACCELEROMETER, 7, parameters) == wanted
+    del parameters["TC_A_ENABLE"]
+    assert thermal_slot(Sensor.ACCELEROMETER, 7, parameters) == (1 if 7.0 in others.values() else None)
+
+
+@pytest.mark.parametrize("device_id", [1, 2**31 - 1, 2**31, 2**32 - 1])
+def test_a_device_id_is_written_as_a_parameter_of_32_bits_holds_it(device_id: int) -> None:
+    assert signed(device_id) == np.array(device_id, np.uint32).view(np.int32)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "zero", "scale"),
+    [
+        (Sensor.GYROSCOPE, "INS_GYR2OFFS_Z", None),
+        (Sensor.ACCELEROMETER, "INS_ACC2OFFS_Z", "INS_ACC2SCAL_Z"),
+        (Sensor.MAGNETOMETER, "COMPASS_OFS2_Z", "COMPASS_DIA2_Z"),
+    ],
+)
+def test_ardupilots_parameter_of_a_constant(sensor: Sensor, zero: str, scale: str | None) -> None:
+    assert ArduPilot().parameter(sensor, 1, "zero", 2) == zero
+    assert ArduPilot().parameter(sensor, 1, "scale", 2) == scale
 
 
 QGROUNDCONTROL = """# Onboard parameters for Vehicle 1

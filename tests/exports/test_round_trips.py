@@ -370,15 +370,17 @@ def test_given_parameters_are_composed_with_constants_of_corrected_readings(
             assert np.abs(found - wanted).max() < EXACT * SIZE[s], (s, degc)
 
 
-def test_the_motors_field_stays_cancelled(tmp_path: Path) -> None:
+@pytest.mark.parametrize("motor", [{"X": 4.0, "Y": -7.0, "Z": 2.5}, {"Y": -7.0}, {}])
+def test_the_motors_field_stays_cancelled(motor: dict[str, float], tmp_path: Path) -> None:
     """logged = D k (raw + OFS) + MOT · current: what the estimate makes of it, the new parameters make of raw ones."""
     case = drawn("ardupilot", 7)
     slot = case.slots[Sensor.MAGNETOMETER]
     n = str(slot + 1) if slot else ""
-    motor = {f"COMPASS_MOT{n}_X": 4.0, f"COMPASS_MOT{n}_Y": -7.0, f"COMPASS_MOT{n}_Z": 2.5, "COMPASS_MOTCT": 2.0}
-    case = replace(case, parameters={**case.parameters, **motor})
+    loaded = {f"COMPASS_MOT{n}_{axis}": value for axis, value in motor.items()} | {"COMPASS_MOTCT": 2.0}
+    case = replace(case, parameters={**case.parameters, **loaded})
     a, b = of_logged(case, Sensor.MAGNETOMETER)
     held = exported(case, composed(case, {s: of_logged(case, s) for s in SENSORS}), tmp_path)
+    assert any(name.startswith(f"COMPASS_MOT{n}_") for name in held) == bool(motor)
     raw, current = readings(Sensor.MAGNETOMETER, 7), np.linspace(0.0, 40.0, 50)
     warm = np.full(50, case.degc)
     before, after = (formulas.ardupilot("magnetometer", slot, raw, p, warm, current) for p in (case.parameters, held))

@@ -11,7 +11,7 @@ import yaml
 
 from fieldcal.exports import AUTOPILOTS, PROGRAMS
 from fieldcal.exports.autopilots.loading import Request
-from fieldcal.exports.calibration import Constants, Triad
+from fieldcal.exports.calibration import Constants, Triad, written
 from fieldcal.names import Sensor
 
 
@@ -39,10 +39,10 @@ def constants(as_of: str = "", vehicle_id: str = "v", **changes: object) -> Cons
 
 def test_numbers_of_yaml_are_numbers() -> None:
     """YAML 1.1 takes 1e-05 for text and 1.0e-05 for a number."""
-    written = yaml.safe_load(PROGRAMS["ros"](constants()).text)["/**"]["ros__parameters"]["fieldcal"]["gyroscope"]
-    assert written["zero"] == [1e-5, 2e22, -3.5]
-    assert written["scale"] == np.diag([0.25, 1e-5, 1.5e-5]).ravel().tolist()
-    assert all(np.isnan(v) for v in written["scale_sd"])
+    told = yaml.safe_load(PROGRAMS["ros"](constants()).text)["/**"]["ros__parameters"]["fieldcal"]["gyroscope"]
+    assert told["zero"] == [1e-5, 2e22, -3.5]
+    assert told["scale"] == np.diag([0.25, 1e-5, 1.5e-5]).ravel().tolist()
+    assert all(np.isnan(v) for v in told["scale_sd"])
 
 
 def test_kalibr_gets_matrices_of_its_sizes() -> None:
@@ -88,6 +88,20 @@ def test_json_has_no_nan() -> None:
     assert json.loads(PROGRAMS["json"](constants()).text)["sensors"]["gyroscope"]["scale_sd"] == [None] * 3
     with pytest.raises(ValueError, match="not JSON compliant"):
         PROGRAMS["json"](constants(temperature_degc=np.nan))
+
+
+def test_what_is_handed_out_names_each_number_by_its_axes() -> None:
+    """Row first: scale_xy is what y's reading adds to x. Of independent axes there are three."""
+    full = np.arange(1.0, 10.0).reshape(3, 3)
+    zero = {"zero_x": 1e-5, "zero_y": 2e22, "zero_z": -3.5}
+    for scale, named in (
+        (full, dict(zip(("x", "xy", "xz", "yx", "y", "yz", "zx", "zy", "z"), full.ravel(), strict=True))),
+        (np.diag([1.0, 2.0, 3.0]), {"x": 1.0, "y": 2.0, "z": 3.0}),
+    ):
+        found = written(constants(scale=scale))
+        assert {w.name: w.value for w in found} == zero | {f"scale_{axes}": value for axes, value in named.items()}
+        assert len(found) == 3 + len(named)
+        assert {(w.sensor, w.unit_id) for w in found} == {("gyroscope", "")}
 
 
 def test_a_zero_without_bends_is_a_line_over_temperature() -> None:

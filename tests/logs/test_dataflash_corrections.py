@@ -162,6 +162,17 @@ def test_while_it_warms_up_corrections_follow_within_half_a_percent_of_the_cubic
     assert worst < 0.005 * span
 
 
+@pytest.mark.parametrize("degc", [-20.0, 40.0, 90.0])
+def test_a_thermal_range_that_is_not_told_is_the_firmwares(degc: float) -> None:
+    """INS_TCALn_TMIN 0, INS_TCALn_TMAX 70 °C."""
+    values, names = random_parameters("ACC", 1, np.random.default_rng(3)), inertial_names("ACC", 1)
+    defaults = {names.thermal_min_degc: 0.0, names.thermal_max_degc: 70.0}
+    untold = {name: value for name, value in values.items() if name not in defaults}
+    warm = Temperatures(np.zeros(1, np.int64), np.array([degc]))
+    found, wanted = (inertial_corrections("ACC", 1, Parameters.of(p), 0, warm)[0] for p in (untold, values | defaults))
+    assert (found.offset, found.offset_per_degc) == (wanted.offset, wanted.offset_per_degc)
+
+
 def test_without_thermal_enable_temperature_does_not_count() -> None:
     values = random_parameters("GYR", 0, np.random.default_rng(1)) | {"INS_TCAL1_ENABLE": 0.0}
     warm = Temperatures(np.arange(100) * 10**9, np.linspace(20, 60, 100))

@@ -155,6 +155,17 @@ def test_the_slope_is_that_of_the_offset() -> None:
     assert correction(A, ACCEL_ID, values, 80.0).offset_per_degc == (0.0, 0.0, 0.0)
 
 
+@pytest.mark.parametrize("warm", [-5.0, 40.0, 120.0])
+def test_temperatures_that_are_not_told_are_the_firmwares(warm: float) -> None:
+    """TC_A0_TREF 25, TC_A0_TMIN 0, TC_A0_TMAX 100 °C."""
+    values = random_parameters(6)
+    defaults = {"TC_A2_TREF": 25.0, "TC_A2_TMIN": 0.0, "TC_A2_TMAX": 100.0}
+    untold = {name: value for name, value in values.items() if name not in defaults}
+    found, wanted = (correction(A, ACCEL_ID, p, warm) for p in (untold, values | defaults))
+    assert (found.offset, found.offset_per_degc) == (wanted.offset, wanted.offset_per_degc)
+    assert correction(A, ACCEL_ID, untold).temperature_degc == 25.0
+
+
 def test_thermal_compensation_holds_only_where_it_is_switched_on() -> None:
     values = random_parameters(4) | {"TC_A_ENABLE": 0.0}
     piece = correction(A, ACCEL_ID, values, 20.0)

@@ -6,16 +6,18 @@ SELECT
     l.value_at_25degc + coalesce(l.slope_per_degc, 0) * (temperature_degc - {reference_degc})
     + coalesce(l.curve_per_degc2, 0) * (temperature_degc - {reference_degc}) ^ 2
     + coalesce(l.curve_per_degc3, 0) * (temperature_degc - {reference_degc}) ^ 3 AS value,
-    sqrt(
-        greatest(
-            l.sd ^ 2 + coalesce(l.slope_per_degc_sd, 0) ^ 2
-            * (
-                (temperature_degc - coalesce(l.best_known_degc, {reference_degc})) ^ 2
-                - ({reference_degc} - coalesce(l.best_known_degc, {reference_degc})) ^ 2
-            ),
-            0
+    CASE WHEN l.sd IS NOT NULL THEN  -- greatest(NULL, 0) is 0
+        sqrt(
+            greatest(
+                l.sd ^ 2 + coalesce(l.slope_per_degc_sd, 0) ^ 2
+                * (
+                    (temperature_degc - coalesce(l.best_known_degc, {reference_degc})) ^ 2
+                    - ({reference_degc} - coalesce(l.best_known_degc, {reference_degc})) ^ 2
+                ),
+                0
+            )
         )
-    ) AS sd,
+    END AS sd,
     l.unit, l.flight_id, l.started_at, l.sequence, l.source, l.session_sd,
     concat(
         l.why,

@@ -18,7 +18,7 @@ from fieldcal.logs.dataflash.applied import (
     inertial_corrections,
     magnetometer_corrections,
 )
-from fieldcal.logs.dataflash.corrections import THERMAL_REFERENCE_DEGC, THERMAL_SCALE
+from fieldcal.logs.dataflash.corrections import THERMAL_RANGE_DEGC, THERMAL_REFERENCE_DEGC, THERMAL_SCALE
 from fieldcal.logs.dataflash.parameters import (
     AUTOPILOT,
     CompassNames,
@@ -103,7 +103,8 @@ def thermal_block(sensor: Sensor, slot: int, parameters: Mapping[str, float]) ->
     if parameters.get(names.thermal_enable) != THERMAL_ON:
         return None
     x = THERMAL_SCALE * np.array([[parameters.get(name, 0.0) for name in power] for power in names.thermal])
-    low, high = parameters.get(names.thermal_min_degc, 0.0), parameters.get(names.thermal_max_degc, 0.0)
+    low = parameters.get(names.thermal_min_degc, THERMAL_RANGE_DEGC[0])
+    high = parameters.get(names.thermal_max_degc, THERMAL_RANGE_DEGC[1])
     return Curve(THERMAL_REFERENCE_DEGC, low, high, x, np.zeros(3))
 
 

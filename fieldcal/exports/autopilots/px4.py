@@ -30,7 +30,7 @@ from fieldcal.names import Sensor
 
 REAL32, INT32 = 9, 6
 AUTOPILOT_COMPONENT = 1
-SCALE_LIMITS = (0.1, 3.0)
+SCALE_LEAST, SCALE_MOST = 0.1, 3.0
 Row = tuple[str, float, int]
 
 
@@ -76,11 +76,11 @@ def _sensor(one: Loadable) -> tuple[list[Row], list[str]]:
         turn, scale = rotation_and_symmetric(one.triad.scale)
         told += dropped_rotation(one.sensor, turn, "PX4")
     diagonal = np.diagonal(scale)
-    if one.sensor != Sensor.GYROSCOPE and not np.all((diagonal >= SCALE_LIMITS[0]) & (diagonal <= SCALE_LIMITS[1])):
-        worst = diagonal[np.argmax(np.abs(np.log(np.abs(diagonal))))]
+    beyond = [] if one.sensor == Sensor.GYROSCOPE else [s for s in diagonal if not SCALE_LEAST <= s <= SCALE_MOST]
+    if beyond:
         return [], [
-            f"{one.sensor}: left out. A scale of {worst:.3g} is beyond the {SCALE_LIMITS[0]:g} to {SCALE_LIMITS[1]:g}"
-            f" that {prefix}?SCALE takes."
+            f"{one.sensor}: left out. A scale of {beyond[0]:.4g} is beyond the {SCALE_LEAST:g} to {SCALE_MOST:g} that"
+            f" {prefix}?SCALE takes."
         ]
     offset, block, more = _offset(one)
     rows: list[Row] = [(f"{prefix}{axis}OFF", offset[i], REAL32) for i, axis in enumerate(AXES)]

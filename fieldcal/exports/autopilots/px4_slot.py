@@ -11,8 +11,16 @@ import numpy as np
 from fieldcal.exports.autopilots.affine import of_raw
 from fieldcal.exports.autopilots.thermal import Curve
 from fieldcal.exports.calibration import Triad
-from fieldcal.geometry.rotation import Array
-from fieldcal.logs.ulog.parameters import AUTOPILOT, AXES, CALIBRATION, SLOTS, THERMAL, correction, slot_of
+from fieldcal.logs.ulog.parameters import (
+    AUTOPILOT,
+    AXES,
+    CALIBRATION,
+    SLOTS,
+    THERMAL,
+    THERMAL_DEGC,
+    correction,
+    slot_of,
+)
 from fieldcal.names import Sensor
 
 SIGNED_ABOVE = 1 << 31
@@ -85,18 +93,11 @@ def thermal_block(sensor: Sensor, device_id: int | None, parameters: Mapping[str
         return None
     own = f"{prefix}{slot}_"
     x = np.array([[parameters.get(f"{own}X{order}_{axis}", 0.0) for axis in range(3)] for order in range(4)])
-    low, high = parameters.get(f"{own}TMIN", -np.inf), parameters.get(f"{own}TMAX", np.inf)
-    return Curve(parameters.get(f"{own}TREF", 0.0), low, high, x[1:], x[0])
+    reference, low, high = (parameters.get(f"{own}{name}", default) for name, default in THERMAL_DEGC.items())
+    return Curve(reference, low, high, x[1:], x[0])
 
 
 def signed(device_id: int) -> int:
     """A device id as a parameter of 32 bits holds it."""
     number = device_id & 0xFFFFFFFF
     return number - (1 << 32) if number >= SIGNED_ABOVE else number
-
-
-def magnetometer_matrix(diagonal: Array, off: Array) -> Array:
-    """S (3, 3) of ?SCALE (3,) and ?ODIAG (3,): xy, xz, yz."""
-    matrix = np.diag(diagonal)
-    matrix[[0, 0, 1], [1, 2, 2]] = matrix[[1, 2, 2], [0, 0, 1]] = off
-    return matrix

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fieldcal.logs.dataflash.corrections import (
     NO_THERMAL,
+    THERMAL_RANGE_DEGC,
     THERMAL_REFERENCE_DEGC,
     Affine,
     Thermal,
@@ -147,8 +148,8 @@ def _thermal(names: InertialNames, parameters: Parameters, at_ns: int) -> Therma
     return Thermal(
         np.array([parameters.triple(power, at_ns) for power in names.thermal]),
         parameters.value(names.calibrated_degc, at_ns),
-        parameters.value(names.thermal_min_degc, at_ns),
-        parameters.value(names.thermal_max_degc, at_ns),
+        parameters.value(names.thermal_min_degc, at_ns, THERMAL_RANGE_DEGC[0]),
+        parameters.value(names.thermal_max_degc, at_ns, THERMAL_RANGE_DEGC[1]),
     )
 
 

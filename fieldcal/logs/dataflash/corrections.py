@@ -22,6 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 
 THERMAL_REFERENCE_DEGC = 35.0
 THERMAL_SCALE = 1e-6
+THERMAL_RANGE_DEGC = (0.0, 70.0)
+"""INS_TCALn_TMIN and _TMAX as the firmware has them until they are set."""
 COMPASS_SCALE_RANGE = (1.0 / 1.5, 1.5)
 """COMPASS_SCALE applies within these limits only; 0 stands for none."""
 

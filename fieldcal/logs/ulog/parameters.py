@@ -27,6 +27,8 @@ SLOTS = 4
 AXES = "XYZ"
 CALIBRATION = {Sensor.GYROSCOPE: "CAL_GYRO", Sensor.ACCELEROMETER: "CAL_ACC", Sensor.MAGNETOMETER: "CAL_MAG"}
 THERMAL = {Sensor.GYROSCOPE: "TC_G", Sensor.ACCELEROMETER: "TC_A", Sensor.MAGNETOMETER: "TC_M"}
+THERMAL_DEGC = {"TREF": 25.0, "TMIN": 0.0, "TMAX": 100.0}
+"""Temperatures of a thermal slot as the firmware has them until they are set."""
 BOARD = "SENS_BOARD_"
 BY_ITSELF = {
     Sensor.GYROSCOPE: ("IMU_GYRO_CAL_EN", "SENS_IMU_AUTOCAL"),
@@ -196,8 +198,7 @@ def _thermal(
     own = f"{prefix}{slot}_"
     for name in (f"{prefix}_ENABLE", f"{own}ID"):
         get(name)
-    reference = get(f"{own}TREF")
-    lowest, highest = get(f"{own}TMIN", -np.inf), get(f"{own}TMAX", np.inf)
+    reference, lowest, highest = (get(f"{own}{name}", default) for name, default in THERMAL_DEGC.items())
     told = reference if temperature_degc is None else temperature_degc
     d = min(max(told, lowest), highest) - reference
     coefficients = np.array([[get(f"{own}X{k}_{axis}") for axis in range(3)] for k in range(_DEGREES)])
