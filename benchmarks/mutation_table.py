@@ -1554,7 +1554,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     (
         "estimation.joint.chain_solver",
         "Normal.eliminate",
-        "flat, solved = (x.reshape(-1, x.shape[2]) for x in (self.right, eliminated))",
+        "flat, solved = (x.reshape(-1, x.shape[2]) for x in (self.right, carried))",
         "1 → 2",
     ): _ANY_NEGATIVE,
     (
@@ -1632,8 +1632,8 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "3 → 4 #2",
     ): "rows end with the second triad",
     (
-        "estimation.joint.measurement_model",
-        "_slow_rate",
+        "estimation.joint.problem",
+        "slow_rate",
         "first, last = max(int(at[0]) - side, 0), int(at[-1]) + side + 1",
         "1 → 2",
     ): _UNREAD,

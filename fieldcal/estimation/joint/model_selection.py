@@ -131,7 +131,8 @@ def _scores(fit: JointFit) -> tuple[dict[str, float], dict[str, dict[str, Array]
     layout, p = layout_of(model, state.values, dip="dip" in fit.layout, lever_arm="lever_arm" in fit.layout)
     probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.vectors))
     normal, _, _ = linearised(model, state, fit.path, layout, p, fit.weight, fit.levels, probe, fit.vps)
-    _, information, gradient = normal.eliminate()
+    eliminated = normal.eliminate()
+    information, gradient = eliminated.information, eliminated.gradient
     tested = np.concatenate([np.arange(p)[layout[name]] for name in names])
     rest = np.setdiff1d(np.arange(p), tested)
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
@@ -221,7 +222,7 @@ def _predicted(model: Model, state: State, vps: VpsRecord | None, constants: Joi
         path = trajectory(model, state)
         weight = robust_weight(model, residuals(model, state, path), levels)
         normal, joints, _ = linearised(model, state, path, layout, p, weight, levels, probe, reference)
-        step = normal.eliminate()[0][:, :, p + GRADIENT]
+        step = normal.eliminate().solved(slice(p + GRADIENT, p + GRADIENT + 1))[:, :, 0]
         state = state.moved(step, np.zeros(p), layout)
         if np.max(np.abs(step[:, :3])) < PREDICT_STEP_RAD:
             break

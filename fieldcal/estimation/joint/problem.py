@@ -18,6 +18,7 @@ TRIADS = ("gyroscope", "accelerometer", "magnetometer")
 # Off-diagonal elements of a triad's matrix that are free: body axes are the accelerometer's, whose x stays where it is.
 OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 CROSS = {"gyroscope": OFF_DIAGONAL, "accelerometer": ((1, 0), (2, 0), (2, 1)), "magnetometer": OFF_DIAGONAL}
+RATE_SIDE_S = 0.03  # of the running mean of rates for a delay, on either side
 # Optional parameters and their sizes: cross-axis terms, the gyroscope's slope with temperature and its sensitivity to
 # specific force, delays of the vector triads behind it, s (`model_selection`); then the clock and the mounting of a VPS
 # (`pose_measurement`).
@@ -228,3 +229,32 @@ def off_diagonal(name: str, cross: Array) -> Array:
     e = np.zeros((3, 3))
     e[tuple(np.array(CROSS[name]).T)] = cross
     return e
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The record predicted from a state: attitude `q` (n, 4) of the sensor axes; `rate` (n, 3), rad/s, the calibrated
+    gyroscope's; `jump` (K−1, 3) of the attitude at the end of each interval, rad, inertial axes, which q has spread
+    over the interval."""
+
+    q: Array
+    rate: Array
+    jump: Array
+
+
+def slow_rate(model: Model, path: Trajectory, span: slice = slice(None)) -> Array:
+    """Running mean of the rate over 2 RATE_SIDE_S, (m, 3): the gyroscope's noise would bias the delay."""
+    at = model.at[span]
+    side = max(1, round(RATE_SIDE_S / model.knots.sample_s))
+    first, last = max(int(at[0]) - side, 0), int(at[-1]) + side + 1
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(path.rate[first:last], axis=0)])
+    low, high = np.maximum(at - side - first, 0), np.minimum(at + side + 1 - first, len(total) - 1)
+    return np.asarray((total[high] - total[low]) / (high - low)[:, None])
+
+
+def turning_at_rows(model: Model, state: State, span: slice = slice(None)) -> tuple[Array, Array]:
+    """Low-passed rate, rad/s, and its derivative, rad/s², at the rows, sensor axes, (m, 3) each."""
+    scaled, gyro = state.values["gyroscope"], model.triads["gyroscope"]
+    scale = scaled[:3] / gyro.spread
+    low_passed, change = np.take(model.readings.turning, model.at[span], axis=1)
+    return scale * (low_passed - gyro.centre) + scaled[3:], scale * change

@@ -8,8 +8,7 @@ import numpy as np
 from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
-from fieldcal.estimation.joint.measurement_model import Trajectory
-from fieldcal.estimation.joint.problem import Model, State
+from fieldcal.estimation.joint.problem import Model, State, Trajectory
 from fieldcal.estimation.segments import true_runs
 from fieldcal.estimation.statistics import robust_sigma, white_noise_sigma
 from fieldcal.geometry.rotation import Array
