@@ -2042,8 +2042,14 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     (
         "estimation.joint.model_selection",
         "_predicted",
-        "step = normal.eliminate()[0][:, :, p + GRADIENT]",
+        "step = normal.eliminate().solved(slice(p + GRADIENT, p + GRADIENT + 1))[:, :, 0]",
         "+ → -",
+    ): "the gradient is the first right-hand side",
+    (
+        "estimation.joint.model_selection",
+        "_predicted",
+        "step = normal.eliminate().solved(slice(p + GRADIENT, p + GRADIENT + 1))[:, :, 0]",
+        "+ → - #2",
     ): "the gradient is the first right-hand side",
     (
         "estimation.joint.model_selection",

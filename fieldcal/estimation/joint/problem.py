@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from fieldcal.estimation.gyroscope.equation_error import from_centred
 from fieldcal.estimation.joint.chain_solver import Knots
 from fieldcal.estimation.segments import run_bounds
+from fieldcal.estimation.statistics import white_noise_sigma
 from fieldcal.geometry.rotation import Array, from_rotation_vector, multiply
 
 # Vector readings are averaged over at most this turn of the vehicle and this time.
@@ -178,6 +180,16 @@ class Model:
         # Nothing is compared at the rows of a model without vectors: one an interval will do.
         return cls(readings, triads, knots, vectors, at if vectors else knots.index)
 
+    @cached_property
+    def gyroscope_noise(self) -> Array:
+        """Sample-to-sample noise of the gyroscope, (3,), units of x."""
+        return white_noise_sigma(self.triads["gyroscope"].x)
+
+    @cached_property
+    def turning_rows(self) -> Array:
+        """`Readings.turning` at the rows, (2, m, 3)."""
+        return np.take(self.readings.turning, self.at, axis=1)
+
     def valid_rows(self) -> np.ndarray:
         """Which vector triads have a reading at each row, (m, vectors) bool."""
         return np.array([self.triads[name].valid for name in self.vectors], dtype=bool).reshape(-1, len(self.at)).T
@@ -256,5 +268,5 @@ def turning_at_rows(model: Model, state: State, span: slice = slice(None)) -> tu
     """Low-passed rate, rad/s, and its derivative, rad/s², at the rows, sensor axes, (m, 3) each."""
     scaled, gyro = state.values["gyroscope"], model.triads["gyroscope"]
     scale = scaled[:3] / gyro.spread
-    low_passed, change = np.take(model.readings.turning, model.at[span], axis=1)
+    low_passed, change = model.turning_rows[:, span]
     return scale * (low_passed - gyro.centre) + scaled[3:], scale * change
