@@ -37,6 +37,7 @@ LEAST_GAIN_SD, BLOCK_S, FEWEST_BLOCKS = 3.0, 2.0, 6
 REFUSED_BY_A_STEP, KEPT_BY_A_STEP = 1.5, 5.0
 FIT_SHARE = 0.6  # of the record; the rest is held out
 PREDICT_ITERATIONS, PREDICT_STEP_RAD = 10, 1e-6  # most iterations, and the step at which they end
+STEP_ITERATIONS = 2  # for constants one step away from those whose attitudes are known
 LEAST_TEMPERATURE_RANGE_DEGC = 1.0
 LEAST_FORCE_MPS2 = 2.0  # rms about the mean; below it gravity hardly turned in the sensor's axes
 LEAST_RATE_RADPS = 0.2  # rms: below it a delay does nothing
@@ -195,7 +196,7 @@ def _gains(fit: JointFit, names: list[str]) -> dict[str, float]:
         for i, name in enumerate(names):
             stepped = replace(current, state=_stepped(current.state, name, steps[name]))
             rest = late[0], without.state, late[2]
-            gain = _gain(late[0], without, _predicted(*rest, stepped, current))
+            gain = _gain(late[0], without, _predicted(*rest, stepped, current, iterations=STEP_ITERATIONS))
             plain = not REFUSED_BY_A_STEP < gain < KEPT_BY_A_STEP
             others = names[i + 1 :]
             if not plain or (gain > LEAST_GAIN_SD and others):
@@ -244,7 +245,15 @@ class _Prediction:
     state: State
 
 
-def _predicted(model: Model, state: State, vps: VpsRecord | None, constants: JointFit, noise: JointFit) -> _Prediction:
+def _predicted(
+    model: Model,
+    state: State,
+    vps: VpsRecord | None,
+    constants: JointFit,
+    noise: JointFit,
+    *,
+    iterations: int = PREDICT_ITERATIONS,
+) -> _Prediction:
     """Prediction with the constants of one fit and the noise levels of another; attitudes and translation are free."""
     levels = noise.levels
     state = replace(state, values=constants.state.values)
@@ -255,7 +264,7 @@ def _predicted(model: Model, state: State, vps: VpsRecord | None, constants: Joi
     free = {name: v for name, v in state.values.items() if name in TERMS or name in PARAMETERS}
     layout, p = layout_of(model, free, dip=False, lever_arm=False)
     probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.vectors))
-    for _ in range(PREDICT_ITERATIONS):
+    for _ in range(iterations):
         path = trajectory(model, state)
         weight = robust_weight(model, residuals(model, state, path), levels)
         normal, joints, _ = linearised(model, state, path, layout, p, weight, levels, probe, reference)

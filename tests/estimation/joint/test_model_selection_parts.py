@@ -400,7 +400,8 @@ class Split:
             raise EstimationError(ReasonCode.JOINT_DIVERGED, "no")
         return Told((*state.names, *names))
 
-    def predicted(self, model: Any, state: Any, vps: Any, constants: Told, noise: Told) -> Told:
+    def predicted(self, model: Any, state: Any, vps: Any, constants: Told, noise: Told, **iterations: int) -> Told:
+        assert iterations == ({"iterations": 2} if constants.step else {})
         assert isinstance(state, Told)
         return constants
 
