@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Mapping
 
 from fieldcal.flight.record import Causes, Record
-from fieldcal.provenance.run_key import LIBRARIES
+from fieldcal.provenance.run_key import VERSIONED
 
 NO_RESULT = "no result yet"
 LONGEST_VALUE = 40
@@ -36,7 +36,7 @@ def _differences(former: Record, now: Causes) -> Iterator[str]:
     if former.get("source") != now["source"]:
         yield "its code changed"
     before, after = former.get("versions", {}), now["versions"]
-    yield from _changed({name: before.get(name) for name in LIBRARIES}, {name: after.get(name) for name in LIBRARIES})
+    yield from _changed({name: before.get(name) for name in VERSIONED}, {name: after.get(name) for name in VERSIONED})
 
 
 def _changed(before: Mapping[str, object], after: Mapping[str, object]) -> Iterator[str]:

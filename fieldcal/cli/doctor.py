@@ -16,6 +16,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 import fieldcal
+from fieldcal import compiled
 from fieldcal.config.find import configuration_of, find_source
 from fieldcal.errors import FieldcalError
 from fieldcal.flows.alive import FOLDER as RUNNING
@@ -70,6 +71,9 @@ def _versions() -> Iterator[Check]:
     old = sys.version_info[:2] < LEAST_PYTHON
     yield Check("python", FAILED if old else OK, found, "Install Python 3.11 or later." if old else None)
     yield Check("fieldcal", OK, fieldcal.__version__)
+    asked = compiled.LIBRARY is None and os.environ.get(compiled.SWITCH) is None
+    advice = "Install a C compiler, then fieldcal once more: the joint estimate takes a third of the time."
+    yield Check("kernel", WARNING if asked else OK, compiled.DESCRIPTION, advice if asked else None)
     try:
         required = importlib.metadata.requires("fieldcal") or []
     except importlib.metadata.PackageNotFoundError:

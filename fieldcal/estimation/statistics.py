@@ -40,6 +40,25 @@ def huber_inflation(weights: ArrayLike) -> float:
     return float(w.mean() / max(float(np.mean(w >= 1.0)), 0.1)) ** 2
 
 
+def power_density(x: ArrayLike, interval_s: float, length: int) -> tuple[Array, Array]:
+    """One-sided power spectral density of each column of x (n, m) by Welch's method: frequencies (f,), Hz, densities
+    (f, m).
+
+    Means over parts of `length` ≤ n samples that overlap by half, their mean taken out, under a Hann window. Equals
+    `scipy.signal.welch(x, 1/interval_s, nperseg=length, axis=0)`, whose module takes as long to import as all others of
+    the pipeline together."""
+    x = np.asarray(x, dtype=float)
+    window = np.hanning(length + 1)[:-1] if length > 1 else np.ones(1)
+    starts = range(0, len(x) - length + 1, length - length // 2)
+    power: Array = np.zeros((length // 2 + 1, x.shape[1]))
+    for start in starts:
+        part = x[start : start + length]
+        power += np.abs(fft.rfft((part - part.mean(axis=0)) * window[:, None], axis=0)) ** 2
+    power *= interval_s / (len(starts) * float(np.sum(window**2)))
+    power[1 : (length + 1) // 2] *= 2.0  # every bin but the first, and an even length's last, stands for two
+    return fft.rfftfreq(length, interval_s), power
+
+
 def white_noise_sigma(x: ArrayLike) -> Array:
     """Sample-to-sample noise of each column of x (n, m), in time order, (m,): robust, from second differences, so that
     motion slower than the sampling does not count."""

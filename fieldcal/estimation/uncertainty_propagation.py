@@ -44,6 +44,11 @@ def attitude_jacobian(vectors: Array, sigma: Array, which: int, logged: Array, s
     return np.concatenate([gain * logged[:, None, :], gain], axis=2)
 
 
+def thinned(n: int) -> slice:
+    """Every so many of n samples that MOST_SAMPLES to twice as many are left."""
+    return slice(None, None, max(1, n // MOST_SAMPLES))
+
+
 def constants_to_gyro(
     t: Array,
     q: Array,
@@ -57,12 +62,10 @@ def constants_to_gyro(
     """Covariance (6, 6) that uncertain vector triads add to the gyroscope's (λ, b).
 
     `pairs` holds, for each independent triad, ∂φ/∂(its constants) (n, 3, 6) in the gyroscope's axes and their
-    covariance (6, 6). δθ = M⁻¹ Σ Sᵀ w R_ns φ with output error's own S, w and M.
+    covariance (6, 6). δθ = M⁻¹ Σ Sᵀ w R_ns φ with output error's own S, w and M. `thinned` samples are enough.
     """
     if not pairs:
         return np.zeros((6, 6))
-    thin = slice(None, None, max(1, len(t) // MOST_SAMPLES))
-    t, q, segment, rate_logged, weight = t[thin], q[thin], segment[thin], rate_logged[thin], weight[thin]
     stretch = shooting_segments(t, segment, stretch_s)
     first = begins_run(stretch)
     centre = rate_logged.mean(axis=0)
@@ -76,7 +79,7 @@ def constants_to_gyro(
     r_nb = body_from_inertial(q).transpose(0, 2, 1)
     total = np.zeros((6, 6))
     for jacobian, covariance in pairs:
-        moved = (r_nb @ jacobian[thin]).reshape(-1, 6)
+        moved = (r_nb @ jacobian).reshape(-1, 6)
         gain = np.linalg.solve(normal, weighted.T @ moved)
         total += gain @ covariance @ gain.T
     transform = from_centred(centre, spread)

@@ -1,8 +1,9 @@
 """`run_key`: the digest that says whether a stage need not run again.
 
 It covers the stage's name, the parameters that change results, the content of the input tables, the versions of numpy,
-scipy and polars, and the meaning of the source that the stage reaches (`fieldcal.provenance`): comments, docstrings and
-formatting do not count, nor do definitions that nothing on the way names. Execution settings never enter.
+scipy and polars, which kernel computes (`fieldcal.compiled`), and the meaning of the source that the stage reaches
+(`fieldcal.provenance`): comments, docstrings and formatting do not count, nor do definitions that nothing on the way
+names. Execution settings never enter.
 """
 
 from __future__ import annotations
@@ -14,12 +15,15 @@ import inspect
 import json
 from collections.abc import Callable, Mapping
 
+from fieldcal.compiled import kernel_name
 from fieldcal.names import Json
 from fieldcal.provenance.reached_code import reach_digest
 from fieldcal.provenance.source_tree import files_below, installed
 
 PROJECT = "fieldcal"
 LIBRARIES = ("numpy", "scipy", "polars")
+KERNEL = "kernel"
+VERSIONED = (*LIBRARIES, KERNEL)
 
 
 def run_key(
@@ -59,8 +63,9 @@ def run_key(
 
 @functools.cache
 def library_versions() -> dict[str, str]:
-    """Versions of the libraries whose change may change results."""
-    return {name: importlib.metadata.version(name) for name in LIBRARIES}
+    """Versions of the libraries whose change may change results, and which kernel computes: C and NumPy round
+    differently."""
+    return {**{name: importlib.metadata.version(name) for name in LIBRARIES}, KERNEL: kernel_name()}
 
 
 @functools.cache

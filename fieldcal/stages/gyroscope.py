@@ -14,7 +14,12 @@ from fieldcal.estimation.gyroscope import equation_error, output_error
 from fieldcal.estimation.gyroscope.equation_error import GyroFit
 from fieldcal.estimation.gyroscope.regressor_noise import smoothed_noise_variance
 from fieldcal.estimation.statistics import white_noise_sigma
-from fieldcal.estimation.uncertainty_propagation import attitude_jacobian, constants_to_equation, constants_to_gyro
+from fieldcal.estimation.uncertainty_propagation import (
+    attitude_jacobian,
+    constants_to_equation,
+    constants_to_gyro,
+    thinned,
+)
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import VECTOR_SENSORS, Json, Method, Sensor, Status
@@ -239,7 +244,9 @@ def _output_error(tables: Tables, s: GyroOutputSettings) -> StageResult:
             " polarity, axes or units of a sensor, or attitudes spoiled by acceleration.",
             measured=measured,
         )
-    propagated = constants_to_gyro(t, q, segment, logged, weight, fit, stretch_s, _triad_uncertainty(tables, s))
+    thin = thinned(len(t))
+    pairs = _triad_uncertainty(tables, s, thin)
+    propagated = constants_to_gyro(t[thin], q[thin], segment[thin], logged[thin], weight[thin], fit, stretch_s, pairs)
     measured["propagated_share_of_variance"] = [
         float(v) for v in np.diagonal(propagated)[:3] / np.diagonal(fit.covariance + propagated)[:3]
     ]
@@ -280,9 +287,9 @@ def _suitable_stretch(start: GyroFit, t: Array, logged: Array, tables: Tables) -
     )
 
 
-def _triad_uncertainty(tables: Tables, s: TriadUncertainty) -> list[tuple[Array, Array]]:
+def _triad_uncertainty(tables: Tables, s: TriadUncertainty, used: slice = slice(None)) -> list[tuple[Array, Array]]:
     """Of each vector triad with a covariance: the Jacobian of the attitude error, sensor axes, to its constants
-    (n, 3, 6), and their covariance (6, 6). See `estimation.uncertainty_propagation`."""
+    (n, 3, 6), at the samples used, and their covariance (6, 6). See `estimation.uncertainty_propagation`."""
     if not any(f"{name}_covariance" in tables for name in VECTOR_SENSORS):
         return []
     samples, attitude = tables["samples"], tables["attitude"]
@@ -299,6 +306,6 @@ def _triad_uncertainty(tables: Tables, s: TriadUncertainty) -> list[tuple[Array,
         if covariance is None or constants(tables[name], name) is None:
             continue
         logged = matrix(samples, triad(name, "smoothed_"))
-        jacobian = attitude_jacobian(vectors, np.array(spread), i, logged, sign[name] * axes)
+        jacobian = attitude_jacobian(vectors[used], np.array(spread), i, logged[used], sign[name] * axes)
         pairs.append((np.einsum("ji,njp->nip", axes, jacobian), covariance_of(covariance)))
     return pairs

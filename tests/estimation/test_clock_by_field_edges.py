@@ -67,7 +67,8 @@ def test_covariance_is_that_of_lag_and_skew_among_thirty_coefficients(known: Kno
     inside = (at >= t_vps[0]) & (at <= t_vps[-1])
     a = attitudes(own.lag_mid_s, own.skew)
     x = np.column_stack([a, np.ones(len(t))])[inside]
-    weight, coefficients, residual = by_field._regressed(x, logged[inside])
+    weight, coefficients, residual = by_field._regressed(x.T, logged[inside].T)
+    residual = residual.T
     h = np.array([1e-4, 1e-5])
     moved = [
         (attitudes(own.lag_mid_s + d[0], own.skew + d[1]) - attitudes(own.lag_mid_s - d[0], own.skew - d[1]))
@@ -196,8 +197,8 @@ def test_the_unit_of_an_axis_does_not_change_the_weights() -> None:
     """Residuals are held against the scatter of their own axis."""
     rng = np.random.default_rng(1)
     x, y = rng.normal(size=(300, 10)), rng.standard_t(3, size=(300, 3))
-    expected = by_field._regressed(x, y)[0]
-    found = by_field._regressed(x, y * [1.0, 1e3, 1e-3])[0]
+    expected = by_field._regressed(x.T, y.T)[0]
+    found = by_field._regressed(x.T, (y * [1.0, 1e3, 1e-3]).T)[0]
     assert expected.min() < 0.7
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numerics_support import autoregressive, rms
+from scipy import signal
 
 from fieldcal.estimation import statistics
 
@@ -158,3 +159,12 @@ def test_variance_by_blocks_needs_some_and_follows_units() -> None:
     shifted = statistics.variance_by_blocks(pull + 5.0, t)
     np.testing.assert_allclose(shifted, statistics.variance_by_blocks(pull, t), rtol=1e-9)
     np.testing.assert_allclose(statistics.variance_by_blocks(-3.0 * pull, t + 7.0), 9.0 * shifted, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("n", "length"), [(1000, 256), (1000, 255), (100, 100), (300, 7)])
+def test_the_power_density_is_welchs(n: int, length: int) -> None:
+    x = np.random.default_rng(1).normal(size=(n, 3)) + np.linspace(0.0, 5.0, n)[:, None]
+    frequency, density = statistics.power_density(x, 0.01, length)
+    at, expected = signal.welch(x, 100.0, nperseg=length, axis=0)
+    np.testing.assert_allclose(frequency, at)
+    np.testing.assert_allclose(density, expected, atol=1e-12 * expected.max())

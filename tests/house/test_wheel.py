@@ -8,16 +8,20 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import textwrap
 import zipfile
 from pathlib import Path
 
 import pytest
+from outside_ci import outside_ci
 
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 
 REPOSITORY = Path(__file__).parents[2]
-LEFT_BEHIND = shutil.ignore_patterns(".*", "*.egg-info", "build", "dist", "__pycache__", "tests", "benchmarks", "docs")
+LEFT_BEHIND = shutil.ignore_patterns(
+    ".*", "*.egg-info", "build", "dist", "__pycache__", "tests", "benchmarks", "docs", "*.so"
+)
 HOSTILE = ("flows", "schemas", "warehouse", "fieldcal", "polars")
 
 
@@ -57,11 +61,36 @@ def test_the_wheel_holds_one_package_and_its_data(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     tops = {name.split("/")[0] for name in names}
     assert "fieldcal" in tops
-    assert {top for top in tops if top != "fieldcal"} == {f"{wheel.name.split('-py3')[0]}.dist-info"}
+    assert {top for top in tops if top != "fieldcal"} == {f"{'-'.join(wheel.name.split('-')[:2])}.dist-info"}
     for needed in ("py.typed", "warehouse/views/history.sql", "report/templates/style.css", "flows/nightly.py"):
         assert f"fieldcal/{needed}" in names
     modules = {str(path.relative_to(REPOSITORY)) for path in (REPOSITORY / "fieldcal").rglob("*.py")}
     assert modules <= set(names)
+
+
+@outside_ci
+def test_without_a_compiler_it_is_installed_and_computes(tmp_path: Path) -> None:
+    source = Path(shutil.copytree(REPOSITORY, tmp_path / "source", symlinks=True, ignore=LEFT_BEHIND))
+    build = (sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path, source)
+    run("env", "CC=false", *build)
+    (found,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(found) as archive:
+        assert not any(name.endswith(".so") for name in archive.namelist())
+        archive.extractall(tmp_path / "installed")
+    program = f"""
+        import sys; sys.path.insert(0, {str(tmp_path / "installed")!r})
+        import fieldcal
+        from fieldcal import compiled
+        from fieldcal.simulation.archive import settings, signals
+        from fieldcal.simulation.experiment import Experiment, simulate
+        from fieldcal.stages.pipeline import run_flight
+        assert fieldcal.__file__.startswith({str(tmp_path)!r})
+        flown = Experiment()
+        print(run_flight(signals(simulate(flown, seed=1)), settings(flown, method="joint"))["joint"].status)
+        print(compiled.DESCRIPTION)
+    """
+    found_by = run(sys.executable, "-P", "-c", textwrap.dedent(program))
+    assert found_by.split("\n")[:2] == ["ok", "NumPy: none was compiled when fieldcal was installed"]
 
 
 def test_what_is_installed_has_no_generic_name(environment: Path) -> None:

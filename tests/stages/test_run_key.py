@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fieldcal import compiled
 from fieldcal.config.configuration import load
 from fieldcal.provenance import run_key
 from fieldcal.provenance.run_key import source_digest
@@ -53,7 +54,8 @@ def test_every_part_of_the_key_counts() -> None:
 
 def test_versions_of_the_libraries_count(monkeypatch: pytest.MonkeyPatch) -> None:
     before = run_key.run_key("s", source_digest(load), {}, {})
-    assert set(run_key.library_versions()) == {"numpy", "scipy", "polars"}
+    assert set(run_key.library_versions()) == {"numpy", "scipy", "polars", "kernel"}
+    assert run_key.library_versions()["kernel"] == compiled.kernel_name()
     monkeypatch.setattr(run_key, "library_versions", lambda: {"numpy": "99"})
     assert run_key.run_key("s", source_digest(load), {}, {}) != before
 

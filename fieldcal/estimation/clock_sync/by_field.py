@@ -17,7 +17,7 @@ from fieldcal.estimation.robust import reweighted
 from fieldcal.estimation.smoothing import differentiate_samples
 from fieldcal.estimation.statistics import huber_inflation, least_squares_covariance, robust_sigma
 from fieldcal.geometry.intervals import interval_of
-from fieldcal.geometry.rotation import Array, body_from_inertial, body_rate, continuous, hermite, skew
+from fieldcal.geometry.rotation import Array, body_from_inertial, body_rate, continuous, hermite
 
 RATE_WINDOW_S, SHORTEST_BLOCK = 0.03, 12
 MIN_READINGS = 200
@@ -92,21 +92,26 @@ def _clock(
         if inside.sum() < MIN_READINGS:
             return None
         attitude = body_from_inertial(hermite(t_vps, q, rate, at[inside]))
-        x = np.column_stack([attitude.reshape(-1, 9), np.ones(len(attitude))])
-        weight, coefficients, residual = _regressed(x, logged[inside])
+        # Samples last: products with a weight for each go along the memory.
+        a = np.ascontiguousarray(attitude.transpose(1, 2, 0))
+        x = np.concatenate([a.reshape(9, -1), np.ones((1, a.shape[2]))])
+        weight, coefficients, residual = _regressed(x, np.ascontiguousarray(logged[inside].T))
         # Ȧ = −S(ω)A; a later lag reads the VPS earlier.
-        slope = (-skew(turning[inside]) @ attitude).reshape(-1, 9) @ coefficients[:9]
+        turn = np.ascontiguousarray(turning[inside].T)
+        moved = np.stack([turn[k] * a[j] - turn[j] * a[k] for j, k in ((1, 2), (2, 0), (0, 1))])
         late = t[inside] - fit.reference_s
-        columns = np.stack([-slope, slope * late[:, None]], axis=2) / np.std(residual, axis=0)[:, None]
-        root = np.sqrt(weight)[:, None]
-        flat, weighted = columns.reshape(len(x), 6) * root, x * root
-        flat = flat - weighted @ np.linalg.lstsq(weighted, flat, rcond=1e-10)[0]
-        sensitivity, e = flat.reshape(len(x), 3, 2), residual / np.std(residual, axis=0) * root
-        step = np.linalg.lstsq(sensitivity.reshape(-1, 2), e.reshape(-1), rcond=1e-14)[0]
+        root, deviation = np.sqrt(weight), np.std(residual, axis=1)[:, None]
+        slope = coefficients[:9].T @ moved.reshape(9, -1) / deviation * root
+        columns, weighted = np.stack([-slope, slope * late]), x * root
+        flat = columns.reshape(6, -1)
+        flat -= np.linalg.lstsq(weighted @ weighted.T, weighted @ flat.T, rcond=None)[0].T @ weighted
+        e = residual / deviation * root
+        by_clock = columns.reshape(2, -1)
+        step = np.linalg.lstsq(by_clock @ by_clock.T, by_clock @ e.reshape(-1), rcond=1e-18)[0]
         lag, skewed = lag + float(step[0]), skewed + float(step[1])
         if abs(step[0]) < 1e-8 and abs(step[1]) < 1e-9:
             break
-    _, covariance = least_squares_covariance(sensitivity, e, nuisance=3 * ELEMENTS)
+    _, covariance = least_squares_covariance(columns.transpose(2, 1, 0), e.T, nuisance=3 * ELEMENTS)
     covariance = covariance * huber_inflation(weight)
     difference = np.array([lag - fit.lag_mid_s, skewed - 1e-6 * fit.skew_ppm])
     total = covariance + fit.covariance + np.diag(fit.spread**2)
@@ -124,13 +129,14 @@ def block_rates(t: Array, q: Array, max_gap_s: float) -> Array:
 
 
 def _regressed(x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """y (n, 3) on x (n, m), robust: weights (n,), coefficients (m, 3), residuals (n, 3)."""
+    """y (3, n) on x (m, n), robust: weights (n,), coefficients (m, 3), residuals (3, n)."""
 
     def solve(weight: Array) -> tuple[tuple[Array, Array], Array]:
-        root = np.sqrt(weight)[:, None]
-        coefficients = np.linalg.lstsq(x * root, y * root, rcond=1e-10)[0]
-        residual = y - x @ coefficients
-        return (coefficients, residual), np.linalg.norm(residual / [robust_sigma(r) for r in residual.T], axis=1)
+        weighted = x * weight
+        coefficients = np.linalg.lstsq(weighted @ x.T, weighted @ y.T, rcond=None)[0]
+        residual = y - coefficients.T @ x
+        sigma = np.array([robust_sigma(r) for r in residual])
+        return (coefficients, residual), np.sqrt(np.sum((residual / sigma[:, None]) ** 2, axis=0))
 
-    (coefficients, residual), weight = reweighted(solve, len(x), rounds=REGRESSION_ROUNDS)
+    (coefficients, residual), weight = reweighted(solve, x.shape[1], rounds=REGRESSION_ROUNDS)
     return weight, coefficients, residual

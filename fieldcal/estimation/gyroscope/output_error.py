@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fieldcal import compiled
+from fieldcal.compiled import attitude as compiled_attitude
 from fieldcal.errors import EstimationError
 from fieldcal.estimation.gyroscope.equation_error import GyroFit, from_centred
 from fieldcal.estimation.segments import begins_run, run_bounds
@@ -46,8 +48,10 @@ def shooting_segments(t: ArrayLike, segment: ArrayLike, longest_s: float) -> np.
 
 def propagate_stretches(t: Array, rate: Array, stretch: Array) -> Array:
     """Attitude (n, 4) relative to the start of each stretch from body rates (n, 3), rad/s."""
-    steps = from_rotation_vector(rotation_steps(t, rate))
     first = begins_run(stretch)
+    if (library := compiled.LIBRARY) is not None:
+        return compiled_attitude.propagate_stretches(library, t, rate, first)
+    steps = from_rotation_vector(rotation_steps(t, rate))
     chain = np.concatenate([[IDENTITY], steps])
     chain[first] = IDENTITY
     # One scan over everything; dividing by its value at each start makes every stretch begin at the identity.
@@ -204,24 +208,23 @@ def fit_output_error(
             length = np.sqrt(np.einsum("ni,ni->n", residual, residual))
             huber = huber_weights(length, robust_sigma(length))
             weight, inflation = trust * huber, huber_inflation(huber)
-        sensitivity = attitude_sensitivity(dt, model, x, first)
-        if not fixed:
-            sensitivity = without_stretch_means(sensitivity, first, weight)
-            centred = without_stretch_means(residual, first, weight)
+        if (library := compiled.LIBRARY) is not None:
+            normal, gradient, square = compiled_attitude.normal_equations(
+                library, t, model, x, first, weight, residual, fixed=fixed
+            )
         else:
-            centred = residual
-        root = np.sqrt(weight)
-        a = (sensitivity * root[:, None, None]).reshape(-1, 6)
-        y = (centred * root[:, None]).reshape(-1)
-        normal = a.T @ a
-        step = np.linalg.lstsq(normal, a.T @ y, rcond=1e-13)[0]
+            sensitivity, centred = _centred(dt, model, x, first, weight, residual, fixed=fixed)
+            normal, gradient, square = _normal_equations(sensitivity, centred, weight)
+        step = np.linalg.lstsq(normal, gradient, rcond=1e-13)[0]
         theta = theta + step
         if not np.isfinite(theta).all():
             break
         # Settled: every step is a small part of the smallest standard deviation one could claim, or of the value
         # itself.
-        claimed = np.sqrt(np.diagonal(np.linalg.pinv(normal, hermitian=True)) * float(y @ y) / (3 * n))
+        claimed = np.sqrt(np.diagonal(np.linalg.pinv(normal, hermitian=True)) * square / (3 * n))
         if (np.abs(step) < np.maximum(0.02 * claimed, 1e-8 * float(np.max(np.abs(theta))))).all():
+            sensitivity, centred = _centred(dt, model, x, first, weight, residual, fixed=fixed)
+            root = np.sqrt(weight)
             white, covariance = least_squares_covariance(
                 sensitivity * root[:, None, None],
                 centred * root[:, None],
@@ -250,6 +253,24 @@ def fit_output_error(
         "Output error found no minimum: the integrated gyroscope never came near the measured attitude.",
         {"iterations": iteration, "attitude_error_rms_rad": float(np.sqrt(np.mean(residual**2)))},
     )
+
+
+def _centred(
+    dt: Array, model: Array, x: Array, first: Array, weight: Array, residual: Array, *, fixed: bool
+) -> tuple[Array, Array]:
+    """Sensitivities (n, 3, 6) and residuals (n, 3), unless `fixed` with the initial attitudes eliminated."""
+    sensitivity = attitude_sensitivity(dt, model, x, first)
+    if fixed:
+        return sensitivity, residual
+    return without_stretch_means(sensitivity, first, weight), without_stretch_means(residual, first, weight)
+
+
+def _normal_equations(sensitivity: Array, residual: Array, weight: Array) -> tuple[Array, Array, float]:
+    """Normal matrix (6, 6), gradient (6,) and weighted square of the residual."""
+    root = np.sqrt(weight)
+    a = (sensitivity * root[:, None, None]).reshape(-1, 6)
+    y = (residual * root[:, None]).reshape(-1)
+    return a.T @ a, a.T @ y, float(y @ y)
 
 
 def attitude_error(

@@ -17,6 +17,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import expm, solve_continuous_lyapunov
 
+from fieldcal import compiled
+from fieldcal.compiled import chain
 from fieldcal.errors import EstimationError
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.geometry.rotation import Array
@@ -120,15 +122,53 @@ class Normal:
             np.zeros((parameters, rights)),
         )
 
-    def eliminate(self) -> tuple[Array, Array, Array]:
-        """Eliminate the knots (`chain_solve`): N_xx⁻¹ right (K, s, c), information of θ (p, p) (the Schur complement
-        N_θθ − N_θx N_xx⁻¹ N_xθ), gradients (p, c − p). Raises EstimationError `joint_singular`."""
+    def blocks(self) -> tuple[Array, Array, Array, Array, Array]:
+        """All arrays, in the order above."""
+        return self.diagonal, self.below, self.right, self.parameters, self.parameters_right
+
+    def eliminate(self) -> Elimination:
+        """Eliminate the knots. Raises EstimationError `joint_singular`."""
         p = len(self.parameters)
-        eliminated = chain_solve(self.diagonal, self.below, self.right)
-        flat, solved = (x.reshape(-1, x.shape[2]) for x in (self.right, eliminated))
-        absorbed = (flat.T @ solved)[:p]
+        factors: tuple[Array, Array] | None = None
+        if (library := compiled.LIBRARY) is not None:
+            found = chain.eliminate(library, self.diagonal, self.below, self.right, p)
+            if found is None:
+                raise _singular()
+            factors, carried, absorbed = found[:2], *found[2:]
+        else:
+            carried = chain_solve(self.diagonal, self.below, self.right)
+            flat, solved = (x.reshape(-1, x.shape[2]) for x in (self.right, carried))
+            absorbed = (flat.T @ solved)[:p]
         information, gradient = self.parameters - absorbed[:, :p], self.parameters_right - absorbed[:, p:]
-        return eliminated, 0.5 * (information + information.T), gradient
+        return Elimination(0.5 * (information + information.T), gradient, carried, factors)
+
+
+@dataclass(frozen=True)
+class Elimination:
+    """Normal equations without their knots: `information` (p, p) of θ, the Schur complement N_θθ − N_θx N_xx⁻¹ N_xθ;
+    `gradient` (p, c − p).
+
+    `carried` (K, s, c) is N_xx⁻¹ right or, where there are `factors` of N_xx (`compiled.chain`), half of the way
+    there: columns that nobody asks for are not solved for."""
+
+    information: Array
+    gradient: Array
+    carried: Array
+    factors: tuple[Array, Array] | None = None
+
+    def solved(self, columns: slice) -> Array:
+        """N_xx⁻¹ of these columns of the right-hand sides, (K, s, ·)."""
+        return self._whole(self.carried[:, :, columns])
+
+    def response(self, theta: Array) -> Array:
+        """The knots' part of the solution where the parameters' is `theta` (p, c − p): N_xx⁻¹ (right − N_xθ θ)."""
+        p = len(theta)
+        return self._whole(self.carried[:, :, p:] - self.carried[:, :, :p] @ theta)
+
+    def _whole(self, columns: Array) -> Array:
+        if self.factors is None or compiled.LIBRARY is None:
+            return columns
+        return chain.substitute(compiled.LIBRARY, *self.factors, columns)
 
 
 def chain_solve(diagonal: Array, below: Array, right: Array) -> Array:
@@ -167,10 +207,14 @@ def _inverse(blocks: Array) -> Array:
     try:
         root = np.linalg.inv(np.linalg.cholesky(blocks))
     except np.linalg.LinAlgError as error:
-        raise EstimationError(
-            ReasonCode.JOINT_SINGULAR, "The joint equations are singular: the readings contradict the start."
-        ) from error
+        raise _singular() from error
     return np.asarray(root.transpose(0, 2, 1) @ root)
+
+
+def _singular() -> EstimationError:
+    return EstimationError(
+        ReasonCode.JOINT_SINGULAR, "The joint equations are singular: the readings contradict the start."
+    )
 
 
 def solve_scaled(information: Array, gradient: Array) -> Array:
@@ -198,6 +242,13 @@ def add_joints(normal: Normal, knots: Knots, joints: Joints, probe: Probe) -> No
     """Add attitude jumps and the translation's process to the normal equations."""
     p = len(normal.parameters)
     weight = knots.joined / (joints.walk * knots.interval_s)
+    if (library := compiled.LIBRARY) is not None:
+        chain.add_jumps(library, joints.jump, joints.moved, weight, probe.jump, normal.blocks())
+        process = _process(knots, joints.strength)
+        drawn = probe.motion * knots.joined[:, None, None]
+        chain.add_motion(library, process, joints.motion, drawn, probe.start, normal.blocks())
+        normal.diagonal[:, range(3), range(3)] += ATTITUDE_PRIOR_PER_RAD2
+        return
     eye = np.eye(3) * weight[:, None, None]
     normal.diagonal[:-1, :3, :3] += eye
     normal.diagonal[1:, :3, :3] += eye

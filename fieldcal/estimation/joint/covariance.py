@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,47 +20,25 @@ TURNS_FOR_STEEP_VECTOR = (("pitch",), ("roll",), ("roll", "pitch"))
 TURNS_FOR_LEVEL_VECTOR = (("yaw",), ("yaw",), ("roll", "pitch"))
 
 
-def covariance(
-    model: Model,
-    chunks: Iterator[tuple[slice, Rows, Array]],
-    response: Array,
-    information: Array,
-    whitening: Array,
-    jumps: tuple[Array, Array],
-    process: tuple[Array, Array],
-    others: tuple[Array, Array] | None = None,
-) -> Array:
-    """Covariance (p, p) of θ: the inverse information, enlarged where the residuals show that it is too small.
+@dataclass(frozen=True)
+class RowSums:
+    """Sums over the rows of each interval, whitened, knots eliminated: `sensitivity` (K, r + 3, p), of which the last
+    three lines are ∂(integrated attitude at the interval's end)/∂θ; `residual` (K, r + 3) and number of readings
+    `count` (K, r + 3), zero in those lines; `score` (K, p) of the rows."""
 
-    Correlation of the noise within an interval is in the whitening already. Correlation over longer times (a field that
-    varies from place to place, a temperature) is measured on means by interval: M = ΣΣ S̄ᵀ𝓡S̄ instead of ΣS̄ᵀS̄ for
-    each residual of the rows, S̄ the sensitivity with the knots eliminated. Noise unlike the model's (strong for some
-    seconds and weak for others, a translation that swings at one frequency) is measured by the scores S̄ᵀr of blocks of
-    time, all residuals together (`variance_by_blocks`). Neither ever makes a standard deviation smaller.
+    sensitivity: Array
+    residual: Array
+    count: Array
+    score: Array
 
-    Parameters
-    ----------
-    chunks
-        `joint.measurement_model.sensitivities` at the solution.
-    response : (K, s, p) array
-        Knots' response N_xx⁻¹N_xθ to the parameters.
-    information : (p, p) array
-        Of θ, knots eliminated.
-    whitening : (m, r) array
-        Robust weights over the density of the noise at low frequency.
-    jumps : (K−1, 3), (K−1,) arrays
-        Attitude jumps at the joints, and 1/their sd: coloured where the gyroscope's bias drifts.
-    process : (K, c, p), (K, c) arrays
-        Whitened sensitivities, knots eliminated, and residuals of the translation's process. Their colour is not used:
-        the fit alone colours them.
-    others : (K, c, p), (K, c) arrays, optional
-        The same of other measurements at the knots (VPS poses).
-    """
-    inverse = inverse_information(information)
-    k, r, p = len(response), whitening.shape[1], len(information)
+
+def sums_of_rows(
+    model: Model, chunks: Iterator[tuple[slice, Rows, Array]], response: Array, whitening: Array
+) -> RowSums:
+    """Of `joint.measurement_model.sensitivities`, by the knots' `response` (K, s, p) to the parameters; `whitening`
+    (m, r) robust weights over the density of the noise at low frequency."""
+    k, r, p = len(response), whitening.shape[1], response.shape[2]
     sensitivity, residual, count = np.zeros((k, r + 3, p)), np.zeros((k, r + 3)), np.zeros((k, r + 3))
-    residual[:-1, r:] = jumps[0] * jumps[1][:, None]
-    sensitivity[:-1, r:] = np.diff(response[:, :3], axis=0)
     score = np.zeros((k, p))
     for knot_span, rows, ends in chunks:
         at = model.at[rows.span]
@@ -75,10 +54,51 @@ def covariance(
         residual[knot_span, :r] = sums_by_interval(model, left, rows.span, knot_span)
         score[knot_span] += sums_by_interval(model, np.einsum("mrp,mr->mp", seen, left), rows.span, knot_span)
         count[knot_span, :r] = sums_by_interval(model, (root > 0).astype(float), rows.span, knot_span)
+    return RowSums(sensitivity, residual, count, score)
+
+
+def covariance(
+    model: Model,
+    rows: RowSums,
+    response: Array,
+    information: Array,
+    jumps: tuple[Array, Array],
+    process: tuple[Array, Array],
+    others: tuple[Array, Array] | None = None,
+) -> Array:
+    """Covariance (p, p) of θ: the inverse information, enlarged where the residuals show that it is too small.
+
+    Correlation of the noise within an interval is in the whitening already. Correlation over longer times (a field that
+    varies from place to place, a temperature) is measured on means by interval: M = ΣΣ S̄ᵀ𝓡S̄ instead of ΣS̄ᵀS̄ for
+    each residual of the rows, S̄ the sensitivity with the knots eliminated. Noise unlike the model's (strong for some
+    seconds and weak for others, a translation that swings at one frequency) is measured by the scores S̄ᵀr of blocks of
+    time, all residuals together (`variance_by_blocks`). Neither ever makes a standard deviation smaller.
+
+    Parameters
+    ----------
+    rows : RowSums
+        At the solution.
+    response : (K, s, p) array
+        Knots' response N_xx⁻¹N_xθ to the parameters.
+    information : (p, p) array
+        Of θ, knots eliminated.
+    jumps : (K−1, 3), (K−1,) arrays
+        Attitude jumps at the joints, and 1/their sd: coloured where the gyroscope's bias drifts.
+    process : (K, c, p), (K, c) arrays
+        Whitened sensitivities, knots eliminated, and residuals of the translation's process. Their colour is not used:
+        the fit alone colours them.
+    others : (K, c, p), (K, c) arrays, optional
+        The same of other measurements at the knots (VPS poses).
+    """
+    inverse = inverse_information(information)
+    r, p = rows.residual.shape[1] - 3, len(information)
+    sensitivity, residual, score = rows.sensitivity.copy(), rows.residual.copy(), rows.score.copy()
+    residual[:-1, r:] += jumps[0] * jumps[1][:, None]
+    sensitivity[:-1, r:] += np.diff(response[:, :3], axis=0)
     sensitivity[:-1, r:] *= jumps[1][:, None, None]
     for seen, left in ((sensitivity[:, r:], residual[:, r:]), process, *([] if others is None else [others])):
         score += np.einsum("kcp,kc->kp", seen, left)
-    scale = 1.0 / np.sqrt(np.maximum(count, 1.0))
+    scale = 1.0 / np.sqrt(np.maximum(rows.count, 1.0))
     sensitivity, residual = sensitivity * scale[..., None], residual * scale
     excess = np.zeros((p, p))
     for row in range(r + 3):

@@ -14,8 +14,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fieldcal import compiled
 from fieldcal.errors import EstimationError
-from fieldcal.estimation.joint import initialise
+from fieldcal.estimation.joint import initialise, kernel
 from fieldcal.estimation.joint.bias_walk import bias_walk
 from fieldcal.estimation.joint.chain_solver import (
     BRIDGE,
@@ -30,11 +31,10 @@ from fieldcal.estimation.joint.chain_solver import (
     solve_scaled,
     whitened_motion,
 )
-from fieldcal.estimation.joint.covariance import covariance, inverse_information
+from fieldcal.estimation.joint.covariance import RowSums, covariance, inverse_information, sums_of_rows
 from fieldcal.estimation.joint.measurement_model import (
     SENSED,
     Rows,
-    Trajectory,
     accumulate,
     body_jumps,
     layout_of,
@@ -43,7 +43,15 @@ from fieldcal.estimation.joint.measurement_model import (
     trajectory,
 )
 from fieldcal.estimation.joint.pose_measurement import VpsRecord
-from fieldcal.estimation.joint.problem import CROSS, TRIADS, Model, PriorConstants, State, off_diagonal
+from fieldcal.estimation.joint.problem import (
+    CROSS,
+    TRIADS,
+    Model,
+    PriorConstants,
+    State,
+    Trajectory,
+    off_diagonal,
+)
 from fieldcal.estimation.joint.score_corrections import logged_units, within_intervals
 from fieldcal.estimation.joint.variance_components import (
     CHANCE_COLOUR_RATIO,
@@ -266,14 +274,18 @@ def _lever_arm_test(fit: JointFit) -> float:
 
 def _enlarged(fit: JointFit, response: Array) -> JointFit:
     """The fit with its covariance from coloured residuals; `response` (K, s, p) of the knots to the parameters."""
-    chunks = sensitivities(fit.model, fit.state, fit.path, fit.layout, len(fit.information))
+    given = fit.model, fit.state, fit.path, fit.layout
     whitening = _whitening(fit.weight, fit.levels)
+    if (library := compiled.LIBRARY) is not None:
+        rows = RowSums(*kernel.covariance_rows(library, *given, whitening, response))
+    else:
+        rows = sums_of_rows(fit.model, sensitivities(*given, len(fit.information)), response, whitening)
     poses = None if fit.vps is None else fit.vps.whitened(fit.model, fit.state, fit.path, fit.layout, response)
     knots = fit.model.knots
     jumps = fit.path.jump, np.sqrt(knots.joined / (fit.levels.walk * knots.interval_s))
     strength = fit.levels.strength
     process = whitened_motion(knots, strength, response[:, 3:]), whitened_motion(knots, strength, fit.state.motion)
-    enlarged = covariance(fit.model, chunks, response, fit.information, whitening, jumps, process, poses)
+    enlarged = covariance(fit.model, rows, response, fit.information, jumps, process, poses)
     # The bias is the mean over the record, from which its random walk takes it away towards either end.
     rate = body_jumps(fit.state, fit.path) / knots.interval_s[:, None]
     walk = bias_walk(rate, knots.interval_s, knots.joined)
@@ -301,14 +313,16 @@ def _iterate(model: Model, state: State, levels: Levels | None, spent: int, how:
         weight = robust_weight(model, residual, levels)
         normal, joints, reaction = linearised(model, state, path, layout, p, weight, levels, probe, vps)
         prior.add(normal, state, layout)
-        eliminated, information, gradient = normal.eliminate()
+        eliminated = normal.eliminate()
+        information, gradient = eliminated.information, eliminated.gradient
         scales = layout["gyroscope"].start + np.arange(3)
         gradient[scales, GRADIENT] += logged_units(model, state, path, levels.walk)
-        within = levels.walk * within_intervals(model, state, layout, reaction, eliminated[:, :, p + BRIDGE])
+        bridge = eliminated.solved(slice(p + BRIDGE, p + BRIDGE + 1))[:, :, 0]
+        within = levels.walk * within_intervals(model, state, layout, reaction, bridge)
         gradient[:, GRADIENT] += within
         # The step (column GRADIENT), and the responses of all unknowns to the probes.
         theta = solve_scaled(information, gradient)
-        response = eliminated[:, :, p:] - eliminated[:, :, :p] @ theta
+        response = eliminated.response(theta)
         step, change = response[:, :, GRADIENT], theta[:, GRADIENT]
         share = _step_share(state, step, change, layout)
         if change @ information @ previous < -LARGEST_REVERSED_STEP_SHARE * (previous @ information @ previous):
@@ -335,7 +349,7 @@ def _iterate(model: Model, state: State, levels: Levels | None, spent: int, how:
             fit = JointFit(
                 model, state, path, levels, weight, layout, plain, information, spent + iteration, vps=vps, options=how
             )
-            return fit, eliminated[:, :, :p]
+            return fit, eliminated.solved(slice(p))
     raise _no_minimum(model, iteration)
 
 
@@ -378,10 +392,13 @@ def linearised(
     reaction = np.zeros((knots, len(SENSED), 2 * rows + 3)), np.zeros((p + 1, 2 * rows + 3))
     moved = np.zeros((knots, 3, p))  # ∂(integrated attitude)/∂θ
     whitening = _whitening(weight, levels)
-    chunk: Rows
-    for knot_span, chunk, ends in sensitivities(model, state, path, layout, p):
-        accumulate(normal, model, chunk, knot_span, whitening[chunk.span], probe, reaction)
-        moved[knot_span] = ends
+    if (library := compiled.LIBRARY) is not None:
+        kernel.normal_rows(library, normal, model, state, path, layout, whitening, probe, reaction, moved)
+    else:
+        chunk: Rows
+        for knot_span, chunk, ends in sensitivities(model, state, path, layout, p):
+            accumulate(normal, model, chunk, knot_span, whitening[chunk.span], probe, reaction)
+            moved[knot_span] = ends
     joints = Joints(path.jump, moved[:-1], levels.walk, state.motion, levels.strength)
     add_joints(normal, model.knots, joints, probe)
     if vps is not None:

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.signal import welch
 
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation import wahba
@@ -17,6 +16,7 @@ from fieldcal.estimation.joint.chain_solver import STATES, place_knots
 from fieldcal.estimation.joint.problem import Model, Readings, State, averaging_side
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.smoothing import differentiate_samples, fill, lattice, smooth_samples
+from fieldcal.estimation.statistics import power_density
 from fieldcal.geometry.earth_field import dip_rad
 from fieldcal.geometry.rotation import (
     Array,
@@ -65,7 +65,7 @@ def _fastest_turning_hz(t: Array, segment: np.ndarray, gyroscope: Array) -> floa
     a, b = max(run_bounds(segment), key=lambda bounds: bounds[1] - bounds[0])
     index, interval_s = lattice(t[a:b])
     x = fill(index, gyroscope[a:b])
-    frequency, density = welch(x, 1.0 / interval_s, nperseg=min(len(x), round(SPECTRUM_S / interval_s)), axis=0)
+    frequency, density = power_density(x, interval_s, min(len(x), round(SPECTRUM_S / interval_s)))
     from_hz = min(NOISE_HZ[0], 0.5 * frequency[-1])
     noise = np.median(density[(frequency >= from_hz) & (frequency <= max(NOISE_HZ[1], from_hz))], axis=0)
     over = np.mean(density / np.maximum(noise, 1e-300), axis=1)

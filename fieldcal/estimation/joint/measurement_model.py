@@ -11,8 +11,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fieldcal import compiled
+from fieldcal.estimation.joint import kernel
 from fieldcal.estimation.joint.chain_solver import BRIDGE, GRADIENT, SENSORS, Knots, Normal, Probe
-from fieldcal.estimation.joint.problem import CROSS, OPTIONAL, TERMS, Model, State, corrected
+from fieldcal.estimation.joint.problem import (
+    CROSS,
+    OPTIONAL,
+    TERMS,
+    Model,
+    State,
+    Trajectory,
+    corrected,
+    slow_rate,
+    turning_at_rows,
+)
 from fieldcal.geometry.rotation import (
     IDENTITY,
     Array,
@@ -26,22 +38,10 @@ from fieldcal.geometry.rotation import (
 )
 
 CHUNK_ROWS = 512  # at a time: a few megabytes with all intermediate arrays, what a core holds in its cache
-RATE_SIDE_S = 0.03  # of the running mean of rates for a delay, on either side
 ACCELERATION = slice(3, 6)  # of a knot's translation
 SENSED = np.array([0, 1, 2, 6, 7, 8])  # states of a knot in which a reading has a derivative: attitude and acceleration
 # The same as pairs of slices: of the states, of SENSED.
 BLOCKS = ((slice(0, 3), slice(0, 3)), (slice(6, 9), slice(3, 6)))
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """The record predicted from a state: attitude `q` (n, 4) of the sensor axes; `rate` (n, 3), rad/s, the calibrated
-    gyroscope's; `jump` (K−1, 3) of the attitude at the end of each interval, rad, inertial axes, which q has spread
-    over the interval."""
-
-    q: Array
-    rate: Array
-    jump: Array
 
 
 def trajectory(model: Model, state: State) -> Trajectory:
@@ -49,6 +49,9 @@ def trajectory(model: Model, state: State) -> Trajectory:
     knots, t = model.knots, model.readings.t
     gyro = state.values["gyroscope"]
     rate = gyro[:3] * corrected(model, state.values, "gyroscope") + gyro[3:]
+    if (library := compiled.LIBRARY) is not None:
+        q, jump = kernel.trajectory(library, model, state, rate)
+        return Trajectory(q, rate, jump)
     since, ends = _since_knots(knots, from_rotation_vector(rotation_steps(t, rate)))
     jump = to_rotation_vector(multiply(state.q[1:], conjugate(multiply(state.q[:-1], ends))))
     jump[~knots.joined] = 0.0
@@ -90,17 +93,15 @@ class Rows:
 
 def lever_arm_geometry(model: Model, state: State, span: slice) -> Array:
     """Acceleration of the sensor about the centre of mass per metre of lever arm, (m, 3, 3): S(ω̇) + S(ω)²."""
-    scaled = state.values["gyroscope"]
-    gyro = model.triads["gyroscope"]
-    scale = scaled[:3] / gyro.spread
-    low_passed, change = np.take(model.readings.turning, model.at[span], axis=1)
-    rate = scale * (low_passed - gyro.centre) + scaled[3:]
+    rate, change = turning_at_rows(model, state, span)
     turn = skew(rate)
-    return np.asarray(skew(scale * change) + turn @ turn)
+    return np.asarray(skew(change) + turn @ turn)
 
 
 def residuals(model: Model, state: State, path: Trajectory) -> Array:
     """Logged minus predicted, (m, r), units of x; 0 where there is no reading."""
+    if (library := compiled.LIBRARY) is not None:
+        return kernel.residuals(library, model, state, path)
     out = np.empty((len(model.at), 3 * len(model.vectors)))
     for span, _ in chunks(model):
         turn = body_from_inertial(path.q[model.at[span]])
@@ -115,19 +116,9 @@ def _sensed(model: Model, state: State, path: Trajectory, span: slice, turn: Arr
     sensed, vector = _sensed_at_once(model, state, span, turn, name)
     delay = state.values.get(f"{name}_delay")
     if delay is not None:
-        turned = from_rotation_vector(-delay * _slow_rate(model, path, span))
+        turned = from_rotation_vector(-delay * slow_rate(model, path, span))
         sensed = np.einsum("nij,nj->ni", body_from_inertial(turned), sensed)
     return sensed, vector
-
-
-def _slow_rate(model: Model, path: Trajectory, span: slice) -> Array:
-    """Running mean of the rate over 2 RATE_SIDE_S, (m, 3): the gyroscope's noise would bias the delay."""
-    at = model.at[span]
-    side = max(1, round(RATE_SIDE_S / model.knots.sample_s))
-    first, last = max(int(at[0]) - side, 0), int(at[-1]) + side + 1
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(path.rate[first:last], axis=0)])
-    low, high = np.maximum(at - side - first, 0), np.minimum(at + side + 1 - first, len(total) - 1)
-    return np.asarray((total[high] - total[low]) / (high - low)[:, None])
 
 
 def _sensed_at_once(model: Model, state: State, span: slice, turn: Array, name: str) -> tuple[Array, Array]:
@@ -204,7 +195,7 @@ def sensitivities(
                 for k, (axis, other) in enumerate(CROSS[name]):
                     by_parameter[:, 3 * i + axis, first + k] = -valid * model.triads[name].x[span, other]
             if f"{name}_delay" in layout:
-                late = np.cross(_slow_rate(model, path, span), sensed)
+                late = np.cross(slow_rate(model, path, span), sensed)
                 by_parameter[:, row, layout[f"{name}_delay"]] = (gain[..., 0] * late)[..., None]
             if name == "magnetometer" and "dip" in layout:
                 turned = model.field(float(state.values["dip"][0]))[1]

@@ -33,8 +33,11 @@ from fieldcal.names import Json
 SCORE_CHI2 = {size: round(float(chdtri(size, 1e-3)), 1) for size in set(TERMS.values())}
 # Least gain of the held-out likelihood over its sd, which comes from at least so many blocks of this length.
 LEAST_GAIN_SD, BLOCK_S, FEWEST_BLOCKS = 3.0, 2.0, 6
+# A gain by one Gauss–Newton step decides outside these; between them the term is fitted.
+REFUSED_BY_A_STEP, KEPT_BY_A_STEP = 1.5, 5.0
 FIT_SHARE = 0.6  # of the record; the rest is held out
 PREDICT_ITERATIONS, PREDICT_STEP_RAD = 10, 1e-6  # most iterations, and the step at which they end
+STEP_ITERATIONS = 2  # for constants one step away from those whose attitudes are known
 LEAST_TEMPERATURE_RANGE_DEGC = 1.0
 LEAST_FORCE_MPS2 = 2.0  # rms about the mean; below it gravity hardly turned in the sensor's axes
 LEAST_RATE_RADPS = 0.2  # rms: below it a delay does nothing
@@ -42,7 +45,8 @@ LEAST_RATE_RADPS = 0.2  # rms: below it a delay does nothing
 
 @dataclass(frozen=True)
 class TermTest:
-    """`score` χ² of the whole record; `gain` of the held-out likelihood over its sd, None where the score refused."""
+    """`score` χ² of the whole record; `gain` of the held-out likelihood over its sd (by one Gauss–Newton step, unless
+    that lay near the limit), None where the score refused."""
 
     name: str
     score: float
@@ -52,7 +56,8 @@ class TermTest:
 
 def add_terms(fit: JointFit) -> tuple[JointFit, list[TermTest]]:
     """The fit with the optional terms that pass both tests, and the result of the tests."""
-    scores, moved = _scores(fit) if candidates(fit) else ({}, {})
+    names = candidates(fit)
+    scores, moved = _scores(fit, names) if names else ({}, {})
     over = {name: score / SCORE_CHI2[TERMS[name]] for name, score in scores.items()}
     tried = sorted((name for name in over if over[name] > 1.0), key=lambda name: -over[name])
     gains = _gains(fit, tried) if tried else {}
@@ -74,7 +79,7 @@ def _doubted(fit: JointFit, moved: list[dict[str, Array]]) -> JointFit:
     for change in moved:
         by = np.zeros(len(covariance))
         for name, values in change.items():
-            if name in fit.layout:  # a lever arm is tested anew beside the terms
+            if name in fit.layout:  # the term itself is not; a lever arm is tested anew beside the terms
                 by[fit.layout[name]] = values
         covariance += np.outer(by, by)
     return replace(fit, covariance=covariance)
@@ -102,9 +107,20 @@ def candidates(fit: JointFit) -> list[str]:
     return out + [f"{name}_cross" for name in fit.model.vectors]
 
 
+def first_part(fit: JointFit, split: int) -> JointFit | None:
+    """The same constants from the samples before `split` alone, started from the whole record's; None where the part
+    has too few poses of a VPS that the fit is by. Raises EstimationError."""
+    model, state, vps = _part(fit, 0, split)
+    if vps is None and fit.vps is not None:
+        return None
+    # What doubt of a lever arm does to the accelerometer's sd is not asked of a part.
+    like = replace(fit, options=replace(fit.options, doubt_lever_arm=False))
+    return _refitted(model, state, fit.levels, like, [], vps)
+
+
 def with_zeros(state: State, names: list[str]) -> State:
-    """The state with these terms free, at zero."""
-    return replace(state, values={**state.values, **{name: np.zeros(TERMS[name]) for name in names}})
+    """The state with these terms free too, at zero where they have no value yet."""
+    return replace(state, values={**{name: np.zeros(TERMS[name]) for name in names}, **state.values})
 
 
 def _refitted(
@@ -123,15 +139,16 @@ def _refitted(
     )
 
 
-def _scores(fit: JointFit) -> tuple[dict[str, float], dict[str, dict[str, Array]]]:
+def _scores(fit: JointFit, names: list[str]) -> tuple[dict[str, float], dict[str, dict[str, Array]]]:
     """χ² of each candidate's first step, with all candidates free and the other parameters following; `fit` is at its
-    optimum. By candidate, if it were free alone: what its first step moves the other parameters by, by name."""
-    names = candidates(fit)
+    optimum. By candidate, if it were free alone: its first step, and what that moves the other parameters by, by
+    name."""
     model, state = fit.model, with_zeros(fit.state, names)
     layout, p = layout_of(model, state.values, dip="dip" in fit.layout, lever_arm="lever_arm" in fit.layout)
     probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.vectors))
     normal, _, _ = linearised(model, state, fit.path, layout, p, fit.weight, fit.levels, probe, fit.vps)
-    _, information, gradient = normal.eliminate()
+    eliminated = normal.eliminate()
+    information, gradient = eliminated.information, eliminated.gradient
     tested = np.concatenate([np.arange(p)[layout[name]] for name in names])
     rest = np.setdiff1d(np.arange(p), tested)
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
@@ -154,14 +171,18 @@ def _scores(fit: JointFit) -> tuple[dict[str, float], dict[str, dict[str, Array]
         alone = np.linalg.pinv(left[these, these], rcond=1e-6, hermitian=True) @ (gradient[own, GRADIENT] * scale[own])
         by = np.zeros(p)
         by[rest] = -scale[rest] * (follow @ alone)
-        moved[name] = {other: by[layout[other]] for other in fit.layout}
+        by[own] = scale[own] * alone
+        moved[name] = {other: by[layout[other]] for other in (*fit.layout, name)}
         at = these.stop
     return out, moved
 
 
 def _gains(fit: JointFit, names: list[str]) -> dict[str, float]:
     """Forward selection on the first part of the record, tested on the rest: gain over its sd of each term, beside the
-    terms accepted before it."""
+    terms accepted before it.
+
+    Constants that one Gauss–Newton step of the first part gives decide where the gain is plain; they cost two
+    linearisations, a fit two dozen."""
     # Predictions ask for no sd.
     fit = replace(fit, options=replace(fit.options, doubt_lever_arm=False))
     n = len(fit.model.readings.t)
@@ -171,14 +192,31 @@ def _gains(fit: JointFit, names: list[str]) -> dict[str, float]:
     try:
         current = _refitted(*early[:2], fit.levels, fit, [], early[2])
         without = _predicted(*late, current, current)
-        for name in names:
-            other = _refitted(early[0], current.state, current.levels, fit, [name], early[2])
-            out[name] = _gain(late[0], without, _predicted(*late, other, current))
-            if out[name] > LEAST_GAIN_SD:
-                current, without = other, _predicted(*late, other, other)
+        steps = _scores(current, names)[1]
+        for i, name in enumerate(names):
+            stepped = replace(current, state=_stepped(current.state, name, steps[name]))
+            rest = late[0], without.state, late[2]
+            gain = _gain(late[0], without, _predicted(*rest, stepped, current, iterations=STEP_ITERATIONS))
+            plain = not REFUSED_BY_A_STEP < gain < KEPT_BY_A_STEP
+            others = names[i + 1 :]
+            if not plain or (gain > LEAST_GAIN_SD and others):
+                other = _refitted(early[0], stepped.state, current.levels, fit, [name], early[2])
+                gain = gain if plain else _gain(late[0], without, _predicted(*rest, other, current))
+                if gain > LEAST_GAIN_SD and others:
+                    current, without = other, _predicted(*rest, other, other)
+                    steps = _scores(current, others)[1]
+            out[name] = gain
     except EstimationError:
         pass
     return out
+
+
+def _stepped(state: State, name: str, moved: Mapping[str, Array]) -> State:
+    """The state with a term free, after its first step."""
+    values = dict(with_zeros(state, [name]).values)
+    for other, change in moved.items():
+        values[other] = values[other] + change
+    return replace(state, values=values)
 
 
 def _part(fit: JointFit, a: int, b: int) -> tuple[Model, State, VpsRecord | None]:
@@ -199,14 +237,23 @@ def _part(fit: JointFit, a: int, b: int) -> tuple[Model, State, VpsRecord | None
 @dataclass(frozen=True)
 class _Prediction:
     """Residuals over their sd: of readings (m, r), with their robust weights, and of the links between knots (K−1,
-    c)."""
+    c); the `state` whose attitudes and translation are the likeliest."""
 
     rows: Array
     weight: Array
     links: Array
+    state: State
 
 
-def _predicted(model: Model, state: State, vps: VpsRecord | None, constants: JointFit, noise: JointFit) -> _Prediction:
+def _predicted(
+    model: Model,
+    state: State,
+    vps: VpsRecord | None,
+    constants: JointFit,
+    noise: JointFit,
+    *,
+    iterations: int = PREDICT_ITERATIONS,
+) -> _Prediction:
     """Prediction with the constants of one fit and the noise levels of another; attitudes and translation are free."""
     levels = noise.levels
     state = replace(state, values=constants.state.values)
@@ -217,11 +264,11 @@ def _predicted(model: Model, state: State, vps: VpsRecord | None, constants: Joi
     free = {name: v for name, v in state.values.items() if name in TERMS or name in PARAMETERS}
     layout, p = layout_of(model, free, dip=False, lever_arm=False)
     probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.vectors))
-    for _ in range(PREDICT_ITERATIONS):
+    for _ in range(iterations):
         path = trajectory(model, state)
         weight = robust_weight(model, residuals(model, state, path), levels)
         normal, joints, _ = linearised(model, state, path, layout, p, weight, levels, probe, reference)
-        step = normal.eliminate()[0][:, :, p + GRADIENT]
+        step = normal.eliminate().solved(slice(p + GRADIENT, p + GRADIENT + 1))[:, :, 0]
         state = state.moved(step, np.zeros(p), layout)
         if np.max(np.abs(step[:, :3])) < PREDICT_STEP_RAD:
             break
@@ -232,7 +279,7 @@ def _predicted(model: Model, state: State, vps: VpsRecord | None, constants: Joi
         error, available = reference.residual(model, state)
         links = np.hstack([links, (error * available[:, None] / reference.sigma_rad)[:-1]])
     return _Prediction(
-        residual / np.sqrt(levels.variance * levels.colour), robust_weight(model, residual, levels), links
+        residual / np.sqrt(levels.variance * levels.colour), robust_weight(model, residual, levels), links, state
     )
 
 

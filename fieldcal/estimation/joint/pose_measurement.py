@@ -15,8 +15,7 @@ import numpy as np
 from fieldcal.estimation.clock_sync.by_field import block_rates
 from fieldcal.estimation.clock_sync.by_rates import SyncFit, align_frames
 from fieldcal.estimation.joint.chain_solver import GRADIENT, Normal
-from fieldcal.estimation.joint.measurement_model import Trajectory
-from fieldcal.estimation.joint.problem import OPTIONAL, Model, State
+from fieldcal.estimation.joint.problem import OPTIONAL, Model, State, Trajectory
 from fieldcal.estimation.statistics import robust_sigma, white_noise_sigma
 from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import (

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from fieldcal.estimation.gyroscope.equation_error import from_centred
 from fieldcal.estimation.joint.chain_solver import Knots
 from fieldcal.estimation.segments import run_bounds
+from fieldcal.estimation.statistics import white_noise_sigma
 from fieldcal.geometry.rotation import Array, from_rotation_vector, multiply
 
 # Vector readings are averaged over at most this turn of the vehicle and this time.
@@ -18,6 +20,7 @@ TRIADS = ("gyroscope", "accelerometer", "magnetometer")
 # Off-diagonal elements of a triad's matrix that are free: body axes are the accelerometer's, whose x stays where it is.
 OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 CROSS = {"gyroscope": OFF_DIAGONAL, "accelerometer": ((1, 0), (2, 0), (2, 1)), "magnetometer": OFF_DIAGONAL}
+RATE_SIDE_S = 0.03  # of the running mean of rates for a delay, on either side
 # Optional parameters and their sizes: cross-axis terms, the gyroscope's slope with temperature and its sensitivity to
 # specific force, delays of the vector triads behind it, s (`model_selection`); then the clock and the mounting of a VPS
 # (`pose_measurement`).
@@ -177,6 +180,16 @@ class Model:
         # Nothing is compared at the rows of a model without vectors: one an interval will do.
         return cls(readings, triads, knots, vectors, at if vectors else knots.index)
 
+    @cached_property
+    def gyroscope_noise(self) -> Array:
+        """Sample-to-sample noise of the gyroscope, (3,), units of x."""
+        return white_noise_sigma(self.triads["gyroscope"].x)
+
+    @cached_property
+    def turning_rows(self) -> Array:
+        """`Readings.turning` at the rows, (2, m, 3)."""
+        return np.take(self.readings.turning, self.at, axis=1)
+
     def valid_rows(self) -> np.ndarray:
         """Which vector triads have a reading at each row, (m, vectors) bool."""
         return np.array([self.triads[name].valid for name in self.vectors], dtype=bool).reshape(-1, len(self.at)).T
@@ -228,3 +241,32 @@ def off_diagonal(name: str, cross: Array) -> Array:
     e = np.zeros((3, 3))
     e[tuple(np.array(CROSS[name]).T)] = cross
     return e
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The record predicted from a state: attitude `q` (n, 4) of the sensor axes; `rate` (n, 3), rad/s, the calibrated
+    gyroscope's; `jump` (K−1, 3) of the attitude at the end of each interval, rad, inertial axes, which q has spread
+    over the interval."""
+
+    q: Array
+    rate: Array
+    jump: Array
+
+
+def slow_rate(model: Model, path: Trajectory, span: slice = slice(None)) -> Array:
+    """Running mean of the rate over 2 RATE_SIDE_S, (m, 3): the gyroscope's noise would bias the delay."""
+    at = model.at[span]
+    side = max(1, round(RATE_SIDE_S / model.knots.sample_s))
+    first, last = max(int(at[0]) - side, 0), int(at[-1]) + side + 1
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(path.rate[first:last], axis=0)])
+    low, high = np.maximum(at - side - first, 0), np.minimum(at + side + 1 - first, len(total) - 1)
+    return np.asarray((total[high] - total[low]) / (high - low)[:, None])
+
+
+def turning_at_rows(model: Model, state: State, span: slice = slice(None)) -> tuple[Array, Array]:
+    """Low-passed rate, rad/s, and its derivative, rad/s², at the rows, sensor axes, (m, 3) each."""
+    scaled, gyro = state.values["gyroscope"], model.triads["gyroscope"]
+    scale = scaled[:3] / gyro.spread
+    low_passed, change = model.turning_rows[:, span]
+    return scale * (low_passed - gyro.centre) + scaled[3:], scale * change

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fieldcal.estimation.joint.measurement_model import SENSED, Trajectory, body_jumps
-from fieldcal.estimation.joint.problem import Model, State
+from fieldcal.estimation.joint.measurement_model import SENSED, body_jumps
+from fieldcal.estimation.joint.problem import Model, State, Trajectory
 from fieldcal.geometry.rotation import Array
 
 

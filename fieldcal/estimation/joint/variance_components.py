@@ -8,10 +8,9 @@ import numpy as np
 from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
-from fieldcal.estimation.joint.measurement_model import Trajectory
-from fieldcal.estimation.joint.problem import Model, State
+from fieldcal.estimation.joint.problem import Model, State, Trajectory
 from fieldcal.estimation.segments import true_runs
-from fieldcal.estimation.statistics import robust_sigma, white_noise_sigma
+from fieldcal.estimation.statistics import robust_sigma
 from fieldcal.geometry.rotation import Array
 
 # Length of a three-axis residual, in sd, beyond which a reading loses influence: χ²₃ exceeds it once in a thousand.
@@ -69,7 +68,7 @@ def first_levels(model: Model, state: State, path: Trajectory, residual: Array) 
 def gyro_walk(model: Model, state: State) -> float:
     """Density of the random walk, rad²/s, that the gyroscope's sample-to-sample noise makes of the integrated
     attitude."""
-    noise = np.max(white_noise_sigma(model.triads["gyroscope"].x) * np.abs(state.values["gyroscope"][:3]))
+    noise = np.max(model.gyroscope_noise * np.abs(state.values["gyroscope"][:3]))
     return float(noise**2 * model.knots.sample_s)
 
 

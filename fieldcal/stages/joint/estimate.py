@@ -16,7 +16,7 @@ from fieldcal.estimation.faults import Fault
 from fieldcal.estimation.joint import model_selection
 from fieldcal.estimation.joint.fit import JointFit
 from fieldcal.estimation.joint.ladder import fit_with_fallbacks
-from fieldcal.estimation.joint.problem import TERMS, PriorConstants, Readings
+from fieldcal.estimation.joint.problem import PriorConstants, Readings
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, from_matrix, multiply
 from fieldcal.names import SENSORS, Approach, Json, Method, Rung, Sensor, Status
@@ -26,7 +26,6 @@ from fieldcal.stages.joint.beside import beside_rows
 from fieldcal.stages.joint.by_vps import (
     ByVps,
     estimate_by_vps,
-    gyroscope_by_vps,
     not_used,
     poses_of,
 )
@@ -108,7 +107,7 @@ def _with_vps(found: ByVps, readings: Readings, tables: Tables, s: JointSettings
     }
     ned = multiply(found.world, found.close.path.q)
     result = _written(triads, fit, ned, tables, s, measured, found.triads)
-    return replace(result, tables={**result.tables, **_held_out(fit, readings, tables, s, poses)})
+    return replace(result, tables={**result.tables, **_held_out(fit, readings, tables, s)})
 
 
 def _by_pose(triad: TriadByPose, sensor: Sensor, s: JointSettings) -> Found:
@@ -166,7 +165,7 @@ def _with_vectors(readings: Readings, tables: Tables, s: JointSettings, by_vps: 
     if (code := by_vps.get("use_vps_reason")) == ReasonCode.CLOCK_RATES_DIFFER:
         fault = Fault(Sensor.GYROSCOPE, "", ReasonCode(code), 0.0, 0.0, True, str(by_vps["use_vps_sentence"]))
         told["faults"] = fault_rows([fault])
-    return replace(result, tables={**result.tables, **told, **_held_out(fit, readings, tables, s, None)})
+    return replace(result, tables={**result.tables, **told, **_held_out(fit, readings, tables, s)})
 
 
 def chosen(s: JointSettings) -> tuple[Sensor, ...]:
@@ -203,28 +202,17 @@ def _lever_arm(s: JointSettings) -> Array | None:
     return None if s.lever_arm_m is None else np.asarray(_axes(s).T @ np.asarray(s.lever_arm_m, dtype=float))
 
 
-def _held_out(
-    fit: JointFit, readings: Readings, tables: Tables, s: JointSettings, poses: AdmittedPoses | None
-) -> dict[str, pl.DataFrame]:
+def _held_out(fit: JointFit, readings: Readings, tables: Tables, s: JointSettings) -> dict[str, pl.DataFrame]:
     """Gyroscope constants from the first part of the flight alone, with `from_ns`, where the rest begins: `verify`
     predicts that. None where the part determines nothing, or another method gives the gyroscope's."""
     if Sensor.GYROSCOPE not in chosen(s):
         return {}
     split = int(HELD_IN_SHARE * len(readings.t))
-    part = readings.part(slice(0, split))
     try:
-        if poses is not None:
-            early, _ = gyroscope_by_vps(part, poses, s)
-        else:
-            start: dict[str, tuple[Array, Array] | None] = {
-                name: fit.constants(name)[:2] for name in SENSORS if name in fit.layout
-            }
-            # The accelerometer's sd, all that doubt of its arm is in, is not asked of this part.
-            outcome = fit_with_fallbacks(part, start, fit.priors, lever_arm=_lever_arm(s), doubt_lever_arm=False)
-            early = outcome.fit
-        kept = [name for name in TERMS if name in fit.layout]
-        early = model_selection.with_terms(early, kept) if kept else early
+        early = model_selection.first_part(fit, split)
     except (UnusableFlight, EstimationError):
+        return {}
+    if early is None:
         return {}
     matrix, bias, covariance, _ = triad_of(early, "gyroscope")
     rows = triad_rows(

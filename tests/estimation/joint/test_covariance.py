@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_record import small
 
-from fieldcal.estimation.joint.covariance import advice, covariance, inverse_information
+from fieldcal.estimation.joint.covariance import advice, covariance, inverse_information, sums_of_rows
 from fieldcal.estimation.joint.measurement_model import Rows
 from fieldcal.estimation.joint.problem import Model
 from fieldcal.estimation.statistics import coloured_information, variance_by_blocks
@@ -60,8 +60,8 @@ class Given:
 
     def found(self, *, poses: bool) -> Array:
         return covariance(
-            self.model, iter(self.rows()), self.response, self.information, self.whitening, self.jumps, self.process,
-            self.poses if poses else None,
+            self.model, sums_of_rows(self.model, iter(self.rows()), self.response, self.whitening), self.response,
+            self.information, self.jumps, self.process, self.poses if poses else None,
         )  # fmt: skip
 
     def by_loops(self, *, poses: bool) -> tuple[Array, Array]:

@@ -76,16 +76,16 @@ def by_spectrum(monkeypatch: pytest.MonkeyPatch, density: Array, top_hz: float =
     """The frequency that is read off a spectrum (bins of RESOLUTION_HZ up to `top_hz`), alike on three axes."""
     asked = []
 
-    def welch(x: Array, rate_hz: float, *, nperseg: int, axis: int) -> tuple[Array, Array]:
-        asked.append((x.shape, rate_hz, nperseg, axis))
+    def power_density(x: Array, interval_s: float, length: int) -> tuple[Array, Array]:
+        asked.append((x.shape, interval_s, length))
         return RESOLUTION_HZ * np.arange(len(density)), np.tile(density[:, None], 3)
 
-    monkeypatch.setattr(initialise, "welch", welch)
+    monkeypatch.setattr(initialise, "power_density", power_density)
     assert len(density) == round(top_hz / RESOLUTION_HZ) + 1
     for seconds, length in ((60.0, 1024), (4.0, 512)):
         t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
         found = fastest(t, np.zeros((len(t), 3)))
-        assert asked.pop() == ((len(t), 3), pytest.approx(RATE_HZ), length, 0)
+        assert asked.pop() == ((len(t), 3), pytest.approx(1.0 / RATE_HZ), length)
     return found
 
 

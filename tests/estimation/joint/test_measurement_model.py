@@ -19,7 +19,7 @@ from fieldcal.estimation.joint.measurement_model import (
     trajectory,
     translation,
 )
-from fieldcal.estimation.joint.problem import TERMS, TRIADS, State
+from fieldcal.estimation.joint.problem import TERMS, TRIADS, State, slow_rate
 from fieldcal.geometry.rotation import Array, body_from_inertial, from_rotation_vector, multiply, skew
 
 ALL = tuple(TERMS)
@@ -27,6 +27,8 @@ ALL = tuple(TERMS)
 # ends of the stretches too.
 INTEGRATED, DELAYED = 2e-4, 6e-3
 STEP, DIFFERENCES = 1e-5, 2e-4  # of finite differences; what second order leaves at a jump of some mrad, relative
+
+pytestmark = pytest.mark.usefixtures("either_kernel")
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -81,12 +83,12 @@ def test_a_delay_s_rate_is_a_mean_over_thirty_ms_on_either_side() -> None:
     flight = small()
     path = trajectory(flight.model, flight.state)
     for span in (slice(0, 50), slice(20, 30), slice(150, len(flight.model.at))):
-        found = measurement_model._slow_rate(flight.model, path, span)
+        found = slow_rate(flight.model, path, span)
         for row, i in zip(found, flight.model.at[span], strict=True):
             np.testing.assert_allclose(row, path.rate[max(i - 6, 0) : i + 7].mean(axis=0), rtol=1e-9)
     slow = small(rate_hz=20.0, spacing_s=0.2, missing=False)
     path = trajectory(slow.model, slow.state)
-    found = measurement_model._slow_rate(slow.model, path, slice(2, 3))
+    found = slow_rate(slow.model, path, slice(2, 3))
     np.testing.assert_allclose(found[0], path.rate[1:4].mean(axis=0), rtol=1e-9)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +18,7 @@ from test_vps_record import aligned, flight, with_vps
 from fieldcal.errors import EstimationError
 from fieldcal.estimation.joint import model_selection
 from fieldcal.estimation.joint.chain_solver import GRADIENT, Probe
-from fieldcal.estimation.joint.fit import JointFit, Options, linearised
+from fieldcal.estimation.joint.fit import JointFit, Options, fit_joint, linearised
 from fieldcal.estimation.joint.measurement_model import layout_of
 from fieldcal.estimation.joint.model_selection import TermTest, add_terms, candidates, summary, with_terms, with_zeros
 from fieldcal.estimation.joint.problem import TERMS
@@ -84,6 +84,18 @@ def test_new_terms_begin_at_zero() -> None:
     found = with_zeros(state, list(TERMS))
     assert {name: found.values[name].tolist() for name in TERMS} == {name: [0.0] * size for name, size in TERMS.items()}
     assert found.values["dip"] is state.values["dip"]
+    begun = {**found.values, "gyroscope_cross": np.ones(6)}
+    assert with_zeros(replace(state, values=begun), list(TERMS)).values["gyroscope_cross"] is begun["gyroscope_cross"]
+
+
+def test_a_first_step_moves_a_term_from_zero_and_what_follows_it() -> None:
+    state = small().state
+    moved = {"dip": np.array([0.5]), "magnetometer_delay": np.array([2e-3])}
+    found = model_selection._stepped(state, "magnetometer_delay", moved)
+    assert found.values["magnetometer_delay"].tolist() == [2e-3]
+    assert found.values["dip"] == pytest.approx(state.values["dip"] + 0.5)
+    assert found.values["gyroscope"] is state.values["gyroscope"]
+    assert "magnetometer_delay" not in state.values
 
 
 def disturbed(*, free_dip: bool = True) -> JointFit:
@@ -129,7 +141,7 @@ def test_scores_are_those_of_the_whole_information_matrix(free_dip: bool) -> Non
     )
     covariance = np.linalg.inv(information)
     step = covariance @ own
-    scores, moved = model_selection._scores(fit)
+    scores, moved = model_selection._scores(fit, names)
     assert list(scores) == names
     begin = 0
     for name in names:
@@ -138,7 +150,9 @@ def test_scores_are_those_of_the_whole_information_matrix(free_dip: bool) -> Non
         expected = step[these] @ np.linalg.inv(covariance[these, these]) @ step[these]
         assert scores[name] == pytest.approx(expected, rel=0.02), name
         alone, gain = left(at[name], rest)
-        by = -gain @ np.linalg.solve(alone, own[these])
+        first = np.linalg.solve(alone, own[these])
+        np.testing.assert_allclose(moved[name][name], first, atol=0.02 * np.abs(first).max())
+        by = -gain @ first
         for other, columns in fit.layout.items():
             place = np.searchsorted(rest, known + np.arange(p)[layout[other]])
             assert len(moved[name][other]) == columns.stop - columns.start
@@ -165,7 +179,7 @@ class Scripted:
         self.fit, self.made, self.doubted, self.asked = record(), [], [], []
         self.fails = False
         moved = {name: {"dip": np.array([float(i)])} for i, name in enumerate(scores)}
-        monkeypatch.setattr(model_selection, "_scores", lambda fit: (scores, moved))
+        monkeypatch.setattr(model_selection, "_scores", lambda fit, names: (scores, moved))
         monkeypatch.setattr(model_selection, "_gains", self.gains_of(gains))
         monkeypatch.setattr(model_selection, "with_terms", self.with_terms)
         monkeypatch.setattr(model_selection, "_doubted", self.doubt)
@@ -265,7 +279,7 @@ def prediction(model: Any, seed: int = 1) -> Any:
     rng = np.random.default_rng(seed)
     m, k = len(model.at), len(model.knots.index)
     return model_selection._Prediction(
-        rng.normal(size=(m, 6)), rng.uniform(0.3, 1.0, size=(m, 6)), rng.normal(size=(k - 1, 12))
+        rng.normal(size=(m, 6)), rng.uniform(0.3, 1.0, size=(m, 6)), rng.normal(size=(k - 1, 12)), small().state
     )
 
 
@@ -335,58 +349,116 @@ def test_parts_of_the_record_begin_where_the_fit_is() -> None:
     assert model.knots.index.tolist() == index[:6].tolist()
 
 
-class Split:
-    """Fits of the first part that predict the rest by given numbers."""
+@dataclass(frozen=True)
+class Told:
+    """What stands for a fit, its state, or a prediction by it: the terms in it, and those after one step only."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, gains: dict[tuple[str, ...], float]) -> None:
-        self.fit, self.parts, self.compared = record(), [], []
-        self.gains, self.fails = gains, ""
+    names: tuple[str, ...] = ()
+    step: str = ""
+    levels: None = None
+
+    @property
+    def state(self) -> Told:
+        return self
+
+
+class Split:
+    """Fits of the first part, and steps of them, that predict the rest by given numbers."""
+
+    def __init__(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        steps: dict[tuple[tuple[str, ...], str], float],
+        fits: dict[tuple[str, ...], float] | None = None,
+    ) -> None:
+        self.fit, self.parts, self.compared, self.scored = record(), [], [], []
+        self.steps, self.fits, self.fails = steps, fits or {}, ""
         monkeypatch.setattr(model_selection, "_part", self.part)
         monkeypatch.setattr(model_selection, "_refitted", self.refitted)
-        monkeypatch.setattr(
-            model_selection, "_predicted", lambda m, s, v, constants, noise: (constants.names, noise.names)
-        )
+        monkeypatch.setattr(model_selection, "_scores", self.scores)
+        monkeypatch.setattr(model_selection, "_stepped", lambda state, name, moved: replace(state, step=name))
+        monkeypatch.setattr(model_selection, "replace", lambda fit, **new: new.get("state", fit))
+        monkeypatch.setattr(model_selection, "_predicted", self.predicted)
         monkeypatch.setattr(model_selection, "_gain", self.gain)
 
     parts: list[tuple[int, int]]
     compared: list[Any]
+    scored: list[Any]
 
     def part(self, fit: JointFit, a: int, b: int) -> Any:
         self.parts.append((a, b))
-        return f"from {a}", SimpleNamespace(names=()), None
+        return f"from {a}", Told(), None
+
+    def scores(self, fit: Told, names: list[str]) -> Any:
+        self.scored.append((fit.names, names))
+        return {}, {name: {} for name in names}
 
     def refitted(self, model: Any, state: Any, levels: Any, like: Any, names: list[str], vps: Any) -> Any:
         assert model == "from 0"
-        if self.fails in names and self.fails:
+        assert names == ([state.step] if state.step else [])
+        if self.fails and self.fails in names:
             raise EstimationError(ReasonCode.JOINT_DIVERGED, "no")
-        all_names = (*state.names, *names)
-        return SimpleNamespace(state=SimpleNamespace(names=all_names), levels=None, names=all_names)
+        return Told((*state.names, *names))
 
-    def gain(self, model: Any, without: Any, term: Any) -> float:
+    def predicted(self, model: Any, state: Any, vps: Any, constants: Told, noise: Told, **iterations: int) -> Told:
+        assert iterations == ({"iterations": 2} if constants.step else {})
+        assert isinstance(state, Told)
+        return constants
+
+    def gain(self, model: Any, without: Told, term: Told) -> float:
         assert model == f"from {self.parts[1][0]}"
-        self.compared.append((without, term))
-        return self.gains[term[0]]
+        self.compared.append((without.names, term.names, term.step))
+        return self.steps[term.names, term.step] if term.step else self.fits[term.names]
 
 
 def test_terms_are_selected_forwards_beside_those_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the first six tenths, to the knot after; the noise is that of the fit without the term."""
-    split = Split(monkeypatch, {("a",): 3.1, ("a", "b"): 3.0, ("a", "c"): 9.0})
-    found = model_selection._gains(split.fit, ["a", "b", "c"])
-    assert found == {"a": 3.1, "b": 3.0, "c": 9.0}
-    assert split.compared == [
-        (((), ()), (("a",), ())),
-        ((("a",), ("a",)), (("a", "b"), ("a",))),
-        ((("a",), ("a",)), (("a", "c"), ("a",))),
-    ]
+    """On the first six tenths, to the knot after. A plain gain needs no fit, unless others are tried beside it."""
+    split = Split(monkeypatch, {((), "a"): 9.0, (("a",), "b"): 1.0, (("a",), "c"): 5.0})
+    assert model_selection._gains(split.fit, ["a", "b", "c"]) == {"a": 9.0, "b": 1.0, "c": 5.0}
+    assert split.compared == [((), (), "a"), (("a",), ("a",), "b"), (("a",), ("a",), "c")]
+    assert split.scored == [((), ["a", "b", "c"]), (("a",), ["b", "c"])]
     n, index = len(split.fit.model.readings.t), split.fit.model.knots.index
     knot = int(index[index >= int(0.6 * n)][0])
     assert split.parts == [(0, knot + 1), (knot, n)]
 
 
+@pytest.mark.parametrize(("by_step", "by_fit", "kept"), [(4.9, 3.0, False), (1.6, 3.1, True)])
+def test_near_the_limit_the_fit_decides(
+    by_step: float, by_fit: float, kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    beside = ("a",) if kept else ()
+    split = Split(monkeypatch, {((), "a"): by_step, (beside, "b"): 1.5}, {("a",): by_fit})
+    assert model_selection._gains(split.fit, ["a", "b"]) == {"a": by_fit, "b": 1.5}
+    assert split.compared == [((), (), "a"), ((), ("a",), ""), (beside, beside, "b")]
+
+
 def test_a_term_that_cannot_be_fitted_ends_the_selection(monkeypatch: pytest.MonkeyPatch) -> None:
-    split = Split(monkeypatch, {("a",): 3.1})
+    split = Split(monkeypatch, {((), "a"): 1.0, ((), "b"): 2.0})
     split.fails = "b"
-    assert model_selection._gains(split.fit, ["a", "b", "c"]) == {"a": 3.1}
+    assert model_selection._gains(split.fit, ["a", "b", "c"]) == {"a": 1.0}
+
+
+def test_a_step_predicts_nearly_as_a_fit_does() -> None:
+    """Cross-axis terms that are there are found by a step as plainly as by the fit; their constants are near."""
+    fit = fit_joint(disturbed().model, disturbed().state, try_lever_arm=False)
+    names = ["magnetometer_cross"]
+    moved = model_selection._scores(fit, names)[1]["magnetometer_cross"]
+    stepped = model_selection._stepped(fit.state, "magnetometer_cross", moved)
+    exact = with_terms(fit, names)
+    found, expected = (x.values["magnetometer_cross"] for x in (stepped, exact.state))
+    assert np.abs(found - expected).max() < 0.2 * np.abs(expected).max()
+
+
+def test_the_first_part_gives_what_the_whole_does_within_its_sd() -> None:
+    given = disturbed()
+    fit = fit_joint(given.model, given.state, try_lever_arm=False)
+    split = int(0.7 * len(given.model.readings.t))
+    part = model_selection.first_part(fit, split)
+    assert part is not None
+    assert len(part.model.readings.t) == split
+    (scale, _, sd), (whole, _, _) = (x.constants("gyroscope") for x in (part, fit))
+    assert (np.abs(scale - whole) < 3.0 * np.sqrt(np.diagonal(sd)[:3])).all()
+    assert not part.options.doubt_lever_arm
 
 
 def test_a_prediction_finds_the_attitudes_and_the_translation_of_known_constants() -> None:

@@ -40,6 +40,8 @@ UNBIASED, WRONG = 0.15, 0.5
 SECOND_ORDER = 0.01  # the same of the attitude's error over what is corrected, with a steady gyroscope
 SHARP = 0.03  # standard error of a mean over probes, relative
 
+pytestmark = pytest.mark.usefixtures("either_kernel")
+
 
 @dataclass(frozen=True)
 class Flight:
@@ -145,7 +147,8 @@ def scores(
     for step in range(steps):
         path = trajectory(model, state)
         normal, _, reaction = linearised(model, state, path, layout, p, weight, flight.levels, probe, None)
-        eliminated, information, gradient = normal.eliminate()
+        found = normal.eliminate()
+        eliminated, information, gradient = found.solved(slice(None)), found.information, found.gradient
         if step + 1 < steps:
             state = state.moved(eliminated[:, :, p + GRADIENT], np.zeros(p), layout)
     added = np.zeros((3, p))
