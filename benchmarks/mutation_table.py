@@ -596,7 +596,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "estimation.clock_sync.by_field",
         "_clock",
         "step = np.linalg.lstsq(by_clock @ by_clock.T, by_clock @ e.reshape(-1), rcond=1e-18)[0]",
-        "1e-18 → 1.1000000000000002e-18",
+        "1e-18 → 1.1000000000000001e-18",
     ): _RCOND,
     (
         "estimation.clock_sync.by_field",
@@ -824,19 +824,19 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("estimation.clock_sync.by_rates", "synchronise", "if runner_up > 0.98 * peak:", "> → >="): _NEVER_MET,
     (
         "estimation.clock_sync.by_rates",
-        "_refine",
+        "_both_valid",
         "inside = (nearest >= 1) & (nearest < len(vps.rate) - 1) & imu.valid",
         ">= → >",
     ): _ENDS_MASKED,
     (
         "estimation.clock_sync.by_rates",
-        "_refine",
+        "_both_valid",
         "inside = (nearest >= 1) & (nearest < len(vps.rate) - 1) & imu.valid",
         "1 → 2",
     ): _ENDS_MASKED,
     (
         "estimation.clock_sync.by_rates",
-        "_refine",
+        "_both_valid",
         "inside = (nearest >= 1) & (nearest < len(vps.rate) - 1) & imu.valid",
         "1 → 2 #2",
     ): _ENDS_MASKED,
@@ -915,12 +915,6 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "- → +",
     ): _AT_A_TIME,
     (
-        "logs.ingest",
-        "TidyLog.facts",
-        'n_temperatures = self._signals["temperature"].rows if self._temperature else 1',
-        "1 → 2",
-    ): "where there is no temperature it divides nothing",
-    (
         "estimation.clock_sync.by_rates",
         "mask_outliers",
         "keep = np.abs(np.linalg.norm(q, axis=1) - 1.0) < 0.05  # not where one is NaN or infinite",
@@ -965,7 +959,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): "rounding of the transforms decides there",
     (
         "estimation.clock_sync.by_rates",
-        "_refine",
+        "_both_valid",
         "inside = (nearest >= 1) & (nearest < len(vps.rate) - 1) & imu.valid",
         "< → <=",
     ): _ENDS_MASKED,

@@ -23,6 +23,7 @@ from fieldcal.config.configuration import Configuration
 from fieldcal.flight.job import Job
 from fieldcal.flight.record import Record
 from fieldcal.flight.versions import versions
+from fieldcal.provenance.run_key import library_versions
 from fieldcal.schemas import FLIGHT_TABLES
 from fieldcal.stages.pipeline import INGEST
 from fieldcal.warehouse.files import write_bytes
@@ -102,7 +103,7 @@ class Ledger:
 
 def _common() -> str:
     """Digest of what every flight's results follow from."""
-    return json.dumps([dict(sources()), versions()], sort_keys=True)
+    return json.dumps([dict(sources()), versions(), library_versions()], sort_keys=True)
 
 
 def _of(job: Job, configuration: Configuration, common: str) -> str:
