@@ -56,7 +56,7 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
         assure(root, [path for table in HISTORY_TABLES for path in history_files(root, table)], strict=True)
         _forget_damaged(root)
         before = _remembered(root)
-        _forget_other_versions(root)
+        _forget_older_versions(root)
         for vehicle_id in decisions(root)["vehicle_id"].unique().sort().to_list():
             settle(root, vehicle_id)  # where deciding was interrupted, rows do not follow yet
         former = Warehouse(root).scan("drift").collect()
@@ -92,14 +92,15 @@ def _forget_damaged(root: Path) -> None:
                 (root / shown).unlink(missing_ok=True)
 
 
-def _forget_other_versions(root: Path) -> None:
-    """Remove trends that another release wrote in another form: they follow from the history and are made anew."""
+def _forget_older_versions(root: Path) -> None:
+    """Remove trends that an older release wrote in another form: they follow from the history and are made anew. Those
+    of a newer one stay, and whoever reads them says so."""
     for path in history_files(root, "drift"):
         try:
-            version = read_facts(path).get(VERSION_KEY)
+            version = int(read_facts(path).get(VERSION_KEY, "0"))
         except (OSError, ValueError):
             continue  # damaged, which publishing tells
-        if version != str(TABLES["drift"].version):
+        if version < TABLES["drift"].version:
             with disk(path, "removed"):
                 path.unlink()
 

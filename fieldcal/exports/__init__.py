@@ -14,6 +14,7 @@ from fieldcal.exports.calibration import Constants, Export, written
 from fieldcal.exports.json_document import json_document
 from fieldcal.exports.kalibr import kalibr
 from fieldcal.exports.ros import imu_calib, imu_pipeline, ros
+from fieldcal.names import SENSORS, Sensor
 
 AUTOPILOTS: dict[str, Callable[[Constants, Request | None], Export]] = {"px4": px4, "ardupilot": ardupilot}
 """Those that something is asked of."""
@@ -26,6 +27,16 @@ PROGRAMS: dict[str, Callable[[Constants], Export]] = {
     "c": c_header,
 }
 FORMATS = (*AUTOPILOTS, *PROGRAMS)
+_ALL: dict[Sensor, tuple[str, ...]] = dict.fromkeys(SENSORS, ("zero", "scale"))
+HELD: dict[str, dict[Sensor, tuple[str, ...]]] = {
+    "ros": _ALL,
+    "imu_calib": {Sensor.ACCELEROMETER: ("zero", "scale")},
+    "imu_pipeline": {},
+    "kalibr": {Sensor.GYROSCOPE: ("scale",), Sensor.ACCELEROMETER: ("scale",)},
+    "json": _ALL,
+    "c": _ALL,
+}
+"""Whose constants, and which, each of the programs is given."""
 
 
 def export_to(to: str, constants: Constants, request: Request | None = None) -> Export:
@@ -38,4 +49,4 @@ def export_to(to: str, constants: Constants, request: Request | None = None) -> 
     """
     if to in AUTOPILOTS:
         return AUTOPILOTS[to](constants, request)
-    return replace(PROGRAMS[to](constants), written=written(constants))
+    return replace(PROGRAMS[to](constants), written=written(constants, HELD[to]))

@@ -7,7 +7,7 @@ Eq. 5 with its offset in logged units: autopilots subtract before they scale, an
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from fieldcal.config.loaded import Loaded
 from fieldcal.geometry.rotation import Array
 from fieldcal.geometry.sensor_model import through
-from fieldcal.names import Rotation
+from fieldcal.names import Rotation, Sensor
 
 NOT_TURNED: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -226,7 +226,8 @@ class Export:
     warnings : tuple of str
         What the target cannot hold, and what is left to do.
     written : tuple of Written
-        The numbers in the text, sensor by sensor.
+        The numbers that were handed out, sensor by sensor: an autopilot's parameters, of other formats the constants
+        that they hold.
 
     Examples
     --------
@@ -240,8 +241,8 @@ class Export:
     written: tuple[Written, ...] = ()
 
 
-def written(constants: Constants) -> tuple[Written, ...]:
-    """The constants themselves, as a format other than an autopilot's has them."""
+def written(constants: Constants, held: Mapping[Sensor, Sequence[str]]) -> tuple[Written, ...]:
+    """The constants that a format other than an autopilot's is given: of each sensor those that it holds."""
     axes = "xyz"
     return tuple(
         Written(constants.unit_ids.get(sensor, ""), sensor, name, float(value))
@@ -255,4 +256,5 @@ def written(constants: Constants) -> tuple[Written, ...]:
                 if i == j or not triad.diagonal
             ),
         )
+        if name.partition("_")[0] in held.get(Sensor(sensor), ())
     )

@@ -78,6 +78,23 @@ def test_the_same_export_again_is_none(root: Path) -> None:
     assert became(root).format == "px4"  # of others no log tells
 
 
+@pytest.mark.parametrize(
+    ("to", "held"),
+    [
+        ("json", {"gyroscope": {"zero", "scale"}}),
+        ("c", {"gyroscope": {"zero", "scale"}}),
+        ("ros", {"gyroscope": {"zero", "scale"}}),
+        ("kalibr", {"gyroscope": {"scale"}}),
+        ("imu_pipeline", {}),
+    ],
+)
+def test_what_a_format_cannot_hold_was_not_handed_out(root: Path, to: str, held: dict[str, set[str]]) -> None:
+    found: dict[str, set[str]] = {}
+    for one in fieldcal.export(fieldcal.Warehouse(root).calibration_at("v"), to).written:
+        found.setdefault(one.sensor, set()).add(one.name.partition("_")[0])
+    assert found == held
+
+
 def one_number(root: Path, *numbers: Written, at: dt.datetime = EXPORTED) -> bool:
     """Remember an export whose text is its numbers."""
     export = Export(" ".join(f"{one.name}={one.value}" for one in numbers), (), numbers)

@@ -8,14 +8,16 @@ from typing import Any
 
 import polars as pl
 import pyarrow.parquet as pq
+import pytest
 from drift_history import publish_fleet
 from history_rows import START, rows
 from older_history import rewrite
 
 from fieldcal.batch.closing import close_night
 from fieldcal.config.configuration import Alerts
+from fieldcal.schemas import TABLES
 from fieldcal.trends.changes import changes, last_usable
-from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.layout import history_files
 
 NOW = START + dt.timedelta(days=100)
@@ -89,7 +91,7 @@ def test_age_is_told_when_it_passes_the_limit(tmp_path: Path) -> None:
     assert "it counts for 5 days" in sooner[0].sentence
 
 
-def test_trends_of_another_release_are_made_anew(tmp_path: Path) -> None:
+def test_trends_of_an_older_release_are_made_anew_and_those_of_a_newer_refused(tmp_path: Path) -> None:
     publish_fleet(tmp_path, units=2, sessions=6)
     close_night(tmp_path, Alerts(expires_days=1e5, idle_days=1e5))
     made = Warehouse(tmp_path).scan("drift").collect()
@@ -97,6 +99,12 @@ def test_trends_of_another_release_are_made_anew(tmp_path: Path) -> None:
     rewrite(tmp_path, path, pq.read_table(path, partitioning=None).drop_columns(["best_known_at"]), 2)
     close_night(tmp_path, Alerts(expires_days=1e5, idle_days=1e5))
     assert Warehouse(tmp_path).scan("drift").collect().equals(made)
+    rewrite(tmp_path, path, pq.read_table(path, partitioning=None), TABLES["drift"].version + 1)
+    newer = path.read_bytes()
+    with pytest.raises(WarehouseError, match="A newer fieldcal wrote it") as caught:
+        close_night(tmp_path, Alerts(expires_days=1e5, idle_days=1e5))
+    assert caught.value.reason_code == "schema_mismatch"
+    assert path.read_bytes() == newer
 
 
 def test_limits_of_the_configuration_reach_the_night(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ MATTERS = {"° in 60 s": 5.0, "° a turn": 3.0, "mg": 5.0, "° of heading": 1.0}
 """Effects from which on a difference is worth a change: of attitude by rates alone, in a full turn, of tilt and speed,
 of course."""
 SURE_SD = 2.0
-"""And from so many standard deviations on."""
+"""And beyond so many standard deviations."""
 ROUNDING = 1e-9
 COLUMNS = ("sensor", "axis", "of", "flies with", "estimate", "difference", "which is", "parameter", "matters")
 
