@@ -34,17 +34,17 @@ def digest(rows: pl.DataFrame) -> str:
     return found.hexdigest()
 
 
-def column_bytes(column: pl.Series) -> Iterator[bytes]:
+def column_bytes(column: pl.Series) -> Iterator[bytes | memoryview]:
     """Nulls and values of a column as bytes, the same on every machine."""
-    yield column.is_null().to_numpy().tobytes()
+    whole = column.null_count() == 0
+    yield np.zeros(len(column), dtype=bool).data if whole else column.is_null().to_numpy().tobytes()
     if column.dtype == pl.String:
-        texts = [text.encode() for text in column.fill_null("")]
+        texts = [text.encode() for text in (column if whole else column.fill_null(""))]
         yield np.array([len(text) for text in texts], dtype="<i8").tobytes()
         yield b"".join(texts)
-    elif column.dtype == pl.Float64:
-        yield column.fill_null(0.0).to_numpy().astype("<f8").tobytes()
-    else:
-        yield column.cast(pl.Int64).fill_null(0).to_numpy().astype("<i8").tobytes()
+        return
+    kind, number = ("<f8", column) if column.dtype == pl.Float64 else ("<i8", column.cast(pl.Int64))
+    yield np.ascontiguousarray((number if whole else number.fill_null(0)).to_numpy(), dtype=kind).data
 
 
 def _plain(value: Json) -> Json:
