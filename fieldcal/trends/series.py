@@ -16,6 +16,9 @@ TIME_SPAN_DAY = 1.0
 FLOOR = 1e-6
 """Smallest sd of a flight, in units of the row's spread: a claim of no error at all is not believed."""
 
+LEAST_UNIT = 1e-150
+"""Of a row whose flights are all 0; its square is a number still."""
+
 LEVEL, TEMPERATURE, TIME = 0, 1, 2
 
 
@@ -145,7 +148,7 @@ def _scaled(h: Histories, grouping: Grouping) -> tuple[Array, Array, Array, Arra
     sd = np.where(finite, h.sd, mean_sd[row])
     centre = grouping.by_row(h.value) / flights
     unit = np.sqrt(grouping.by_row((h.value - centre[row]) ** 2 + sd**2) / flights)
-    unit = np.maximum(unit, np.maximum(1e-12 * np.abs(centre), 1e-300))
+    unit = np.maximum(unit, np.maximum(1e-12 * np.abs(centre), LEAST_UNIT))
     return centre, unit, (h.value - centre[row]) / unit[row], np.maximum((sd / unit[row]) ** 2, FLOOR**2)
 
 

@@ -11,7 +11,7 @@ from numerics_support import ROUNDING
 from scipy import optimize
 
 from fieldcal.trends.random_effects import Grouping, fit_random_effects
-from fieldcal.trends.regression import FALSE_ALARMS, FALSE_OUTLIERS, alarms, analyse, statuses
+from fieldcal.trends.regression import FALSE_ALARMS, FALSE_OUTLIERS, Trends, alarms, analyse, statuses
 from fieldcal.trends.series import ENOUGH_SESSIONS, Histories
 from fieldcal.trends.siblings import moderated_variance, outliers, sibling_distance
 
@@ -353,3 +353,22 @@ def test_without_times_there_is_no_order_to_find_a_step_in() -> None:
     assert np.isnan(trends.change_size).all()
     assert np.isnan(trends.last_z).all()
     assert np.isfinite(trends.value).all()
+
+
+@pytest.mark.parametrize("sd", [0.0, np.nan, 1e-3])
+def test_a_row_of_nothing_but_zeros_is_a_row(sd: float) -> None:
+    """As of an agreement that is perfect: others are judged as without it."""
+    others = np.random.default_rng(1).normal(size=(2, 12))
+    days = 7.0 * np.arange(12)
+
+    def trends(values: np.ndarray) -> Trends:
+        n = len(values)
+        row, when = np.repeat(np.arange(n), 12), np.tile(days, n)
+        warm, sds = np.full(12 * n, 25.0), np.full(12 * n, sd)
+        return analyse(Histories(row, when.astype(int), when, warm, values.ravel(), sds, kind=np.arange(n)))
+
+    whole, without = trends(np.vstack([np.zeros(12), others])), trends(others)
+    assert whole.value[0] == 0.0
+    assert 0.0 < whole.sd[0] <= 1e-3
+    np.testing.assert_allclose(whole.value[1:], without.value, rtol=EXACT)
+    np.testing.assert_allclose(whole.sd[1:], without.sd, rtol=EXACT)
