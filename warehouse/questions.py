@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.decisions.withdrawn import decisions, withdrawn_flights
 
+MOST_NAMED = 5
 COLUMNS = (
     "started_at",
     "vehicle_id",
@@ -37,15 +39,65 @@ COLUMNS = (
 def calibration_history(
     root: Path, vehicle: str | None, sensor: str | None, parameter: str | None, since: str | None
 ) -> pl.DataFrame:
-    """Rows of `calibration`, oldest flight first, flights of unknown time at the end."""
-    rows = existing(root).scan("calibration", vehicle_id=vehicle)
-    for column, wanted in (("sensor", sensor), ("parameter", parameter)):
-        if wanted is not None:
-            rows = rows.filter(pl.col(column) == wanted)
+    """Rows of `calibration`, oldest flight first, flights of unknown time at the end.
+
+    Raises
+    ------
+    FieldcalError
+        `not_found`: the history has no such vehicle, sensor or parameter. `wrong_option`: `since` is no date.
+    """
+    rows = those_asked_for(existing(root), "calibration", vehicle, sensor, parameter)
     if since is not None:
         rows = rows.filter(pl.col("started_at") >= moment_of("--since", since))
     order = ["started_at", "vehicle_id", "sequence", "flight_id", "unit_id", "sensor", "method", "parameter", "axis"]
     return rows.sort(order, nulls_last=True).select(COLUMNS).collect()
+
+
+def those_asked_for(
+    warehouse: Warehouse, table: str, vehicle: str | None, sensor: str | None, parameter: str | None
+) -> pl.LazyFrame:
+    """Rows of a table of these alone. A name that the history does not have is a mistake, not an empty answer.
+
+    Raises
+    ------
+    FieldcalError
+        `not_found`, with the nearest that there is.
+    """
+    if vehicle is not None:
+        known_vehicle(warehouse, vehicle)
+    rows = warehouse.scan(table, vehicle_id=vehicle)
+    for column, wanted in (("sensor", sensor), ("parameter", parameter)):
+        if wanted is None:
+            continue
+        known = warehouse.scan(table).select(pl.col(column).unique()).collect()[column].to_list()
+        if known and wanted not in known:
+            raise FieldcalError(
+                ReasonCode.NOT_FOUND, f"No {column} {wanted!r} is in table {table}; {nearest(wanted, known)}."
+            )
+        rows = rows.filter(pl.col(column) == wanted)
+    return rows
+
+
+def known_vehicle(warehouse: Warehouse, vehicle_id: str) -> None:
+    """Make sure that the history has flights of a vehicle.
+
+    Raises
+    ------
+    FieldcalError
+        `not_found`, with the nearest that there are.
+    """
+    known = warehouse.scan("flight").select(pl.col("vehicle_id").unique()).collect()["vehicle_id"].to_list()
+    if vehicle_id not in known:
+        told = f'No flight of a vehicle "{vehicle_id}" is in the history; {nearest(vehicle_id, known)}.'
+        raise FieldcalError(ReasonCode.NOT_FOUND, told)
+
+
+def nearest(wanted: str, known: Collection[str]) -> str:
+    """What there is instead of a name that is not: those most like it, else the first."""
+    from difflib import get_close_matches
+
+    near = get_close_matches(wanted, sorted(known), n=3, cutoff=0.5) or sorted(known)[:MOST_NAMED]
+    return f"there is {', '.join(near)}" if near else "the history is empty"
 
 
 def units_flown(warehouse: Warehouse, vehicle_id: str | None = None) -> pl.DataFrame:

@@ -128,7 +128,7 @@ class Warehouse(query.Warehouse):
         Raises
         ------
         FieldcalError
-            `wrong_option`: `since` is no date.
+            `not_found`: the history has no such vehicle, sensor or parameter; `wrong_option`: `since` is no date.
         """
         moment = since.isoformat() if isinstance(since, datetime) else since
         return calibration_history(self.root, vehicle, sensor, parameter, moment)

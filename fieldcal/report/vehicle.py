@@ -13,7 +13,6 @@ from fieldcal.exports.autopilots.comparison import COLUMNS, compared, lines
 from fieldcal.exports.calibration_at import constants_of
 from fieldcal.exports.handed_out import handed_out
 from fieldcal.names import GRAVEST_FIRST, SENSORS, DriftStatus, Status
-from fieldcal.reason_codes import ReasonCode
 from fieldcal.report.history import LatestCalibration, RefusedRow, as_of_sentence, newest, reason_of, usable_flights
 from fieldcal.report.links import Links, flight_name
 from fieldcal.report.page import Column, Folded, Heading, Notice, Page, Part, Section, Simple, Table, Text, badge
@@ -27,7 +26,7 @@ from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
 from fieldcal.stages.beside.warm_up import PARAMETER as WARM_UP_SLOPE
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.decisions.withdrawn import decisions
-from fieldcal.warehouse.questions import existing, units_flown
+from fieldcal.warehouse.questions import existing, known_vehicle, units_flown
 from fieldcal.words.flights import decision_sentence
 from fieldcal.words.numbers import number
 from fieldcal.words.rows import typed, unfolded
@@ -41,8 +40,7 @@ def vehicle_page(root: Path, vehicle_id: str, links: Links, as_of: datetime | No
     """The page, from the history below `root`."""
     warehouse = existing(root)
     flights = warehouse.scan("flight", vehicle_id=vehicle_id).sort(FLOWN_ORDER, nulls_last=False).collect()
-    if flights.is_empty():
-        raise FieldcalError(ReasonCode.NOT_FOUND, _no_vehicle(warehouse, vehicle_id))
+    known_vehicle(warehouse, vehicle_id)
     moment = as_of or newest(warehouse)
     imus = list(dict.fromkeys(reversed(flights["imu_id"].to_list())))
     flown = units_flown(warehouse, vehicle_id)
@@ -78,15 +76,6 @@ def vehicle_page(root: Path, vehicle_id: str, links: Links, as_of: datetime | No
         "Written by fieldcal from its history tables; equal tables give an equal page.",
         links.up(),
     )
-
-
-def _no_vehicle(warehouse: Warehouse, vehicle_id: str) -> str:
-    from difflib import get_close_matches
-
-    known = sorted(warehouse.scan("flight").select(pl.col("vehicle_id").unique()).collect()["vehicle_id"].to_list())
-    near = get_close_matches(vehicle_id, known, n=3, cutoff=0.5) or known[:5]
-    there = f"there is {', '.join(near)}" if near else "the history is empty"
-    return f'No flight of a vehicle "{vehicle_id}" is in the history; {there}.'
 
 
 def _units(warehouse: Warehouse, vehicle_id: str, flown: pl.DataFrame) -> list[str]:

@@ -14,9 +14,11 @@ import polars as pl
 
 from fieldcal.config.configuration import parse
 from fieldcal.config.flight_settings import FlightSettings, flight_settings
+from fieldcal.errors import FieldcalError
 from fieldcal.logs.mcap.write import pose_channel, raw_imu_channel, write_mcap
 from fieldcal.logs.ulog.write import Rows, write_ulog
 from fieldcal.names import SENSORS, Sensor
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.simulation.experiment import Experiment, SimulatedFlight, constants_at, simulate
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, triad
 
@@ -51,6 +53,11 @@ def write_flights(
     log_format : {"mcap", "csv", "ulog"}
         One MCAP file, a folder with imu.csv and vps.csv, or one ULog file with PX4's raw topics.
 
+    Raises
+    ------
+    FieldcalError
+        `wrong_option`: the folder has another configuration, which is never overwritten.
+
     Examples
     --------
     >>> import tempfile
@@ -64,12 +71,14 @@ def write_flights(
         raise ValueError(f'log_format is "mcap", "csv" or "ulog", not {log_format!r}')
     base, folder = experiment or Experiment(), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    flown = {f"sim-{v + 1}": base if v == 0 else _varied(base, v) for v in range(vehicles)}
+    configuration = folder / "fieldcal.toml"
+    text = "\n\n".join(_vehicle_table(vehicle_id, own) for vehicle_id, own in flown.items()) + "\n"
+    if configuration.exists() and configuration.read_text(encoding="utf-8") != text:
+        told = f"{configuration} is another configuration than these flights need, and stays: give another folder."
+        raise FieldcalError(ReasonCode.WRONG_OPTION, told)
     logs = []
-    described = []
-    for v in range(vehicles):
-        vehicle_id = f"sim-{v + 1}"
-        own = base if v == 0 else _varied(base, v)
-        described.append(_vehicle_table(vehicle_id, own))
+    for v, (vehicle_id, own) in enumerate(flown.items()):
         for k in range(sessions):
             day = FIRST_FLIGHT + timedelta(days=7 * k)
             session = folder / vehicle_id / f"{day:%Y-%m-%d}"
@@ -80,7 +89,8 @@ def write_flights(
                 recording = simulate(replace(own, seed=seed))
                 start = day + timedelta(minutes=20 * i)
                 logs.append(write_flight(session, f"flight-{i + 1:02d}", recording, start, log_format=log_format))
-    (folder / "fieldcal.toml").write_text("\n\n".join(described) + "\n", encoding="utf-8")
+    if not configuration.exists():
+        configuration.write_text(text, encoding="utf-8")
     return sorted(logs)
 
 

@@ -26,7 +26,7 @@ from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.decisions.withdrawn import decisions, withdrawn_flights
 from fieldcal.warehouse.layout import history_files, vehicle_of
 from fieldcal.warehouse.publish import publish
-from fieldcal.warehouse.questions import existing
+from fieldcal.warehouse.questions import existing, those_asked_for
 from fieldcal.warehouse.store import empty_frame, read_table
 from fieldcal.words.rows import typed
 
@@ -268,11 +268,14 @@ def _with_drift(root: Path) -> set[str]:
 
 
 def drift_rows(root: Path, vehicle: str | None, sensor: str | None, parameter: str | None) -> pl.DataFrame:
-    """Rows of the table as it was published, what is not stable first."""
-    rows = existing(root).scan("drift", vehicle_id=vehicle)
-    for column, wanted in (("sensor", sensor), ("parameter", parameter)):
-        if wanted is not None:
-            rows = rows.filter(pl.col(column) == wanted)
+    """Rows of the table as it was published, what is not stable first.
+
+    Raises
+    ------
+    FieldcalError
+        `not_found`: the history has no such vehicle, the table no such sensor or parameter.
+    """
+    rows = those_asked_for(existing(root), "drift", vehicle, sensor, parameter)
     rank = pl.col("status").replace_strict(
         {str(status): place for place, status in enumerate(GRAVEST_FIRST)}, default=5, return_dtype=pl.Int8
     )

@@ -152,9 +152,21 @@ def test_the_history_in_three_forms(capsys: pytest.CaptureFixture[str], warehous
     listed = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
     assert [float(row["value"]) for row in listed] == [row["value"] for row in rows]
     assert document(capsys, *asked, "--json", "--since", "2026-02-01") == []
-    assert document(capsys, *asked, "--json", "--vehicle", "nobody") == []
     assert run(asked) == 0
     assert "gyroscope" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["history", "drift"])
+@pytest.mark.parametrize(
+    ("option", "misspelt", "nearest"),
+    [("--vehicle", "sim1", "there is sim-1"), ("--parameter", "scales", "there is scale"), ("--vehicle", "x", "sim-1")],
+)
+def test_a_name_that_the_history_does_not_have_is_told_with_the_nearest(
+    capsys: pytest.CaptureFixture[str], warehouse: Path, command: str, option: str, misspelt: str, nearest: str
+) -> None:
+    told = sentence(capsys, command, option, misspelt, "--warehouse", str(warehouse), code=2)
+    assert misspelt in told
+    assert nearest in told
 
 
 def test_sql_reads_and_nothing_else(capsys: pytest.CaptureFixture[str], warehouse: Path) -> None:
@@ -185,6 +197,11 @@ def test_simulate_writes_what_it_is_asked(capsys: pytest.CaptureFixture[str], tm
     assert not (Path(logs[0]) / "vps.csv").exists()
     assert "lever_arm_m = [0.05, 0.02, -0.03]" in (tmp_path / "fieldcal.toml").read_text()
     assert json.loads((Path(logs[0]).parent / "flight-01.truth.json").read_text())["seed"] == 7
+    again = [*made, "--lever-arm", "0.05,0.02,-0.03", "--dip-deg", "60", "--seed", "8"]
+    assert len(document(capsys, *again)["logs"]) == 1  # the same configuration
+    (tmp_path / "fieldcal.toml").write_text("# mine\n")
+    assert "stays: give another folder" in sentence(capsys, *again, code=2)
+    assert (tmp_path / "fieldcal.toml").read_text() == "# mine\n"
 
 
 @pytest.mark.parametrize(

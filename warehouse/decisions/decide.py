@@ -17,7 +17,7 @@ from fieldcal.schemas.rows import DecisionRow
 from fieldcal.warehouse.decisions.withdrawn import PARTS
 from fieldcal.warehouse.publish import append, settle
 from fieldcal.warehouse.query import Warehouse
-from fieldcal.warehouse.questions import existing
+from fieldcal.warehouse.questions import existing, nearest
 from fieldcal.warehouse.store import empty_frame
 
 LEAST_PREFIX = 6
@@ -44,9 +44,9 @@ def flights_meant(root: Path, target: str, session: str | None = None) -> pl.Dat
             several = ", ".join(found["flight_id"].head(NEAR).to_list())
             raise FieldcalError(ReasonCode.NOT_FOUND, f"Several flights' ids begin with {target!r}: {several}.")
     if found.is_empty():
-        raise FieldcalError(
-            ReasonCode.NOT_FOUND, f"No vehicle, flight or log {target!r} is known; {_near(flights, target)}."
-        )
+        known = {*flights["vehicle_id"], *flights["log_uri"], *flights["flight_id"]}
+        told = f"No vehicle, flight or log {target!r} is known; {nearest(target, known)}."
+        raise FieldcalError(ReasonCode.NOT_FOUND, told)
     of_session = found if session is None else found.filter(pl.col("session_id") == session)
     if of_session.is_empty():
         there = ", ".join(found["session_id"].unique(maintain_order=True).tail(NEAR).to_list())
@@ -139,13 +139,3 @@ def _some(rows: pl.DataFrame, part: Mapping[str, str]) -> None:
             what = f"{name.removesuffix('_id')} {part[name]!r}"
             raise FieldcalError(ReasonCode.NOT_FOUND, f"These flights have no constant of {what}; there is: {there}.")
         rows = own
-
-
-def _near(flights: pl.DataFrame, target: str) -> str:
-    from difflib import get_close_matches
-
-    known = [*flights["vehicle_id"].unique(maintain_order=True), *flights["log_uri"], *flights["flight_id"]]
-    near = (
-        get_close_matches(target, known, n=3, cutoff=0.5) or flights["vehicle_id"].unique().sort().head(NEAR).to_list()
-    )
-    return f"there is {', '.join(near)}" if near else "the history is empty"
