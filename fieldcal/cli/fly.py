@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 import fieldcal
-from fieldcal.cli.options import AsJson, Config, Output, Root, UnusedConfig
+from fieldcal.cli.options import AsJson, Config, Output, Root, UnusedConfig, Whole
 from fieldcal.reason_codes import ReasonCode
 
 Format = Literal["px4", "ardupilot", "ros", "imu_calib", "imu_pipeline", "kalibr", "json", "c"]
@@ -24,7 +24,7 @@ def export(
     unit: str | None = None,
     params: Path | None = None,
     logged_raw: bool = False,
-    system_id: int = 1,
+    system_id: Whole = 1,
     author: str | None = None,
     output: Output = None,
     warehouse: Root = None,

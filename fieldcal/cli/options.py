@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 
+
+def _whole(type_: object, tokens: Sequence[Token]) -> int:
+    """A whole number, which the library that reads the command line would make of any other by rounding it."""
+    text = tokens[0].value
+    try:
+        return int(text)
+    except ValueError as error:
+        raise ValueError(f"{text} is no whole number.") from error
+
+
+Whole = Annotated[int, Parameter(converter=_whole)]
 Config = Annotated[Path | None, Parameter(help="fieldcal.toml to use; else the archive's own, if it has one.")]
 UnusedConfig = Annotated[Path | None, Parameter(show=False)]
 """Every command takes `--config`; these need nothing of it."""
@@ -19,7 +31,7 @@ AsCsv = Annotated[bool, Parameter(name="--csv", negative="", help="CSV on stdout
 DryRun = Annotated[bool, Parameter(help="List what would run; change nothing.")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 SessionFolder = Annotated[Path, Parameter(name="SESSION_DIR")]
-Workers = Annotated[int, Parameter(help="Processes that calibrate; results do not depend on it.")]
+Workers = Annotated[int, Parameter(converter=_whole, help="Processes that calibrate; results do not depend on it.")]
 Runner = Annotated[
     Literal["process", "dask", "pool"],
     Parameter(help="Where they run: on this machine, on a Dask cluster, or in the work pool of prefect.yaml."),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from fieldcal.cli.options import AsJson, Config, Root, SessionFolder
+from fieldcal.cli.options import AsJson, Config, Root, SessionFolder, Whole
 from fieldcal.reason_codes import ReasonCode
 
 EVERY_NIGHT = "0 3 * * *"
@@ -19,7 +19,7 @@ def serve(
     timezone: str | None = None,
     watch: Path | None = None,
     quiet: float = 60.0,
-    workers: int = 1,
+    workers: Whole = 1,
     warehouse: Root = None,
     config: Config = None,
 ) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 import fieldcal
-from fieldcal.cli.options import AsJson, UnusedConfig, UnusedRoot
+from fieldcal.cli.options import AsJson, UnusedConfig, UnusedRoot, Whole
 from fieldcal.reason_codes import ReasonCode
 
 if TYPE_CHECKING:
@@ -22,11 +22,11 @@ def simulate(
     folder: Path,
     /,
     *,
-    seed: int = 0,
+    seed: Whole = 0,
     log_format: Annotated[Literal["mcap", "csv", "ulog"], Parameter(name="--format")] = "mcap",
-    vehicles: int = 1,
-    sessions: int = 1,
-    flights: int = 1,
+    vehicles: Whole = 1,
+    sessions: Whole = 1,
+    flights: Whole = 1,
     duration: float = 40.0,
     translation_rms: float = 0.0,
     lever_arm: str = "0,0,0",
@@ -37,7 +37,7 @@ def simulate(
     gyro_random_walk: float = 0.0,
     lost_share: float = 0.0,
     jitter: float = 0.0,
-    magnetic_bursts: int = 0,
+    magnetic_bursts: Whole = 0,
     vps_dropouts: float = 0.0,
     vps_outliers: float = 0.0,
     vps_misalignment_deg: float = 0.0,

@@ -215,6 +215,9 @@ def test_simulate_writes_what_it_is_asked(capsys: pytest.CaptureFixture[str], tm
         (["history", "--since", "yesterday", "--warehouse", "."], "--since"),
         (["simulate", "x", "--lever-arm", "1,2"], "--lever-arm"),
         (["simulate", "x", "--lost-share", "1.5"], "--lost-share"),
+        (["simulate", "x", "--flights", "1.5"], "--flights"),
+        (["nightly", ".", "--workers", "1.5"], "--workers"),
+        (["serve", ".", "--workers", "2.5"], "--workers"),
     ],
 )
 def test_mistakes_in_use_end_in_2(capsys: pytest.CaptureFixture[str], tokens: list[str], word: str) -> None:
