@@ -98,7 +98,7 @@ def test_what_is_handed_out_names_each_number_by_its_axes() -> None:
         (full, dict(zip(("x", "xy", "xz", "yx", "y", "yz", "zx", "zy", "z"), full.ravel(), strict=True))),
         (np.diag([1.0, 2.0, 3.0]), {"x": 1.0, "y": 2.0, "z": 3.0}),
     ):
-        found = written(constants(scale=scale))
+        found = written(constants(scale=scale), {Sensor.GYROSCOPE: ("zero", "scale")})
         assert {w.name: w.value for w in found} == zero | {f"scale_{axes}": value for axes, value in named.items()}
         assert len(found) == 3 + len(named)
         assert {(w.sensor, w.unit_id) for w in found} == {("gyroscope", "")}

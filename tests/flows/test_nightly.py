@@ -17,6 +17,7 @@ from typing import Any
 import polars as pl
 import pytest
 from older_history import age
+from outside_ci import outside_ci
 
 from fieldcal.batch.documents import Batch
 from fieldcal.batch.flights import flights
@@ -339,7 +340,7 @@ def wait_for_stages(root: Path, count: int, process: subprocess.Popen[bytes]) ->
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("stages_done", [3, 16])
+@pytest.mark.parametrize("stages_done", [3, pytest.param(16, marks=outside_ci)])
 def test_a_killed_night_ends_like_an_uninterrupted_one(
     simulated: Path, first_night: tuple[Path, Any], tmp_path: Path, stages_done: int
 ) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from distributed import LocalCluster
+from outside_ci import outside_ci
 
 from fieldcal.batch.steps import STEPS
 from fieldcal.errors import FieldcalError
@@ -102,7 +103,10 @@ def test_a_missing_work_pool_is_told(archive: Path, tmp_path: Path, prefect_serv
         run_night(archive, tmp_path, None, None, 2, runner="pool")
 
 
-@pytest.mark.parametrize(("workers", "seed", "zone"), [("2", "1", "Asia/Tokyo"), ("4", "0", "America/New_York")])
+@pytest.mark.parametrize(
+    ("workers", "seed", "zone"),
+    [pytest.param("2", "1", "Asia/Tokyo", marks=outside_ci), ("4", "0", "America/New_York")],
+)
 def test_workers_order_seed_and_time_zone_make_no_difference(
     archive: Path, content: str, tmp_path: Path, workers: str, seed: str, zone: str
 ) -> None:

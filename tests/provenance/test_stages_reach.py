@@ -241,7 +241,7 @@ def source_of(module: str) -> str:
     [
         pytest.param(ROTATION, marks=outside_ci),
         pytest.param("fieldcal.geometry.sensor_model", marks=outside_ci),
-        "fieldcal.stages.tables",
+        pytest.param("fieldcal.stages.tables", marks=outside_ci),
     ],
 )
 def test_each_definition_in_turn_concerns_those_that_name_it(module: str) -> None:
