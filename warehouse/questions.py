@@ -12,7 +12,7 @@ from fieldcal.errors import FieldcalError
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.warehouse import Warehouse, WarehouseError
-from fieldcal.warehouse.decisions.withdrawn import decisions, withdrawn_flights
+from fieldcal.warehouse.decisions.withdrawn import counting
 
 MOST_NAMED = 5
 COLUMNS = (
@@ -105,7 +105,7 @@ def units_flown(warehouse: Warehouse, vehicle_id: str | None = None) -> pl.DataF
     each sensor, on the IMU of its latest flight that was not withdrawn."""
     last = (
         warehouse.scan("calibration", vehicle_id=vehicle_id)
-        .filter("is_primary", ~pl.col("flight_id").is_in(withdrawn_flights(decisions(warehouse.root))))
+        .filter("is_primary", counting(warehouse.root))
         .sort(FLOWN_ORDER, nulls_last=False)
         .with_columns(now=pl.col("imu_id").last().over("vehicle_id"))
         .filter(pl.col("imu_id") == pl.col("now"))

@@ -17,6 +17,7 @@ from fieldcal.config.loaded import Loaded
 from fieldcal.geometry.rotation import Array
 from fieldcal.geometry.sensor_model import through
 from fieldcal.names import Rotation, Sensor
+from fieldcal.stages.tables import AXES
 
 NOT_TURNED: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -243,16 +244,15 @@ class Export:
 
 def written(constants: Constants, held: Mapping[Sensor, Sequence[str]]) -> tuple[Written, ...]:
     """The constants that a format other than an autopilot's is given: of each sensor those that it holds."""
-    axes = "xyz"
     return tuple(
         Written(constants.unit_ids.get(sensor, ""), sensor, name, float(value))
         for sensor, triad in constants.triads.items()
         for name, value in (
-            *((f"zero_{axis}", triad.zero[i]) for i, axis in enumerate(axes)),
+            *((f"zero_{axis}", triad.zero[i]) for i, axis in enumerate(AXES)),
             *(
                 (f"scale_{a}" if i == j else f"scale_{a}{b}", triad.scale[i, j])
-                for i, a in enumerate(axes)
-                for j, b in enumerate(axes)
+                for i, a in enumerate(AXES)
+                for j, b in enumerate(AXES)
                 if i == j or not triad.diagonal
             ),
         )

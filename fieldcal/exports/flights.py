@@ -15,7 +15,7 @@ from fieldcal.names import Rotation
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.stages.composition import ORIGIN
 from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.decisions.withdrawn import decisions, withdrawn_flights
+from fieldcal.warehouse.decisions.withdrawn import counting
 
 
 class Flights:
@@ -28,9 +28,8 @@ class Flights:
     @cached_property
     def further(self) -> list[str]:
         """unit_id of each unit that was on board the latest flight, of those not withdrawn, beside the primary ones."""
-        withdrawn = withdrawn_flights(decisions(self._warehouse.root))
         rows = self._warehouse.scan("calibration", vehicle_id=self._vehicle_id)
-        rows = rows.filter(~pl.col("flight_id").is_in(withdrawn))
+        rows = rows.filter(counting(self._warehouse.root))
         latest = rows.sort(FLOWN_ORDER, nulls_last=False).select("flight_id").last().collect()
         if latest.is_empty():
             return []

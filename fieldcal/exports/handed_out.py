@@ -15,6 +15,7 @@ from pathlib import Path
 
 import polars as pl
 
+from fieldcal.exports import AUTOPILOTS
 from fieldcal.exports.calibration import Constants, Export
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import SAME_VALUE
@@ -141,9 +142,7 @@ def _latest_flight(root: Path, vehicle_id: str) -> str | None:
 def handed_out(root: Path, vehicle_id: str) -> list[HandedOut]:
     """The latest export of each sensor of a vehicle to an autopilot, and what became of it."""
     warehouse = existing(root)
-    exports = (
-        warehouse.scan("export", vehicle_id=vehicle_id).filter(pl.col("format").is_in(["px4", "ardupilot"])).collect()
-    )
+    exports = warehouse.scan("export", vehicle_id=vehicle_id).filter(pl.col("format").is_in(list(AUTOPILOTS))).collect()
     if exports.is_empty():
         return []
     columns = [*FLOWN_ORDER, "sensor", "name", "set_to"]

@@ -19,7 +19,7 @@ from fieldcal.trends.regression import Trends
 from fieldcal.trends.series import Histories
 from fieldcal.trends.temperature_curve import ORDER, Curve, about_reference, combined, of_sessions, together, widening
 from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.decisions.withdrawn import decisions, withdrawn_flights
+from fieldcal.warehouse.decisions.withdrawn import counting
 
 Source = tuple[Array, Array]
 """Coefficients (3,) at 25 °C and their information (3, 3)."""
@@ -53,7 +53,7 @@ def bends_of(root: Path) -> Bends:
         .scan("run")
         .filter(
             (pl.col("stage") == METHOD) & (pl.col("status") == Status.OK),
-            ~pl.col("flight_id").is_in(withdrawn_flights(decisions(root))),
+            counting(root),
         )
     )
     found: dict[tuple[str, str, str], Source] = {}

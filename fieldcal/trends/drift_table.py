@@ -23,7 +23,7 @@ from fieldcal.trends.reasons import AGREEMENT, VPS, reason
 from fieldcal.trends.series import Histories
 from fieldcal.trends.warm_up_slopes import slopes_of_warm_ups
 from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.decisions.withdrawn import decisions, withdrawn_flights
+from fieldcal.warehouse.decisions.withdrawn import counting
 from fieldcal.warehouse.layout import history_files, vehicle_of
 from fieldcal.warehouse.publish import publish
 from fieldcal.warehouse.questions import existing, those_asked_for
@@ -138,7 +138,7 @@ def history_of_everything(root: Path) -> pl.DataFrame:
     fit = (
         warehouse.scan("fit")
         .filter((pl.col("signal") == "raw") & (pl.col("sample") == "all"))
-        .filter(~pl.col("flight_id").is_in(withdrawn_flights(decisions(root))))
+        .filter(counting(root))
         .join(warm, on=flight, how="left")
         .with_columns(
             sensor=pl.lit(AGREEMENT),

@@ -33,6 +33,11 @@ def withdrawn_flights(decided: pl.DataFrame) -> list[str]:
     return last.filter(pl.col("decision") == Decision.WITHDRAW)["flight_id"].to_list()
 
 
+def counting(root: Path) -> pl.Expr:
+    """Of rows with a flight_id those whose flight was not withdrawn."""
+    return ~pl.col("flight_id").is_in(withdrawn_flights(decisions(root)))
+
+
 def as_decided(table: str, rows: pl.DataFrame, decided: pl.DataFrame) -> pl.DataFrame:
     """Rows of a table among `DECIDED` with the status that the last decision about each gives it: `ok` becomes
     `withdrawn` and `withdrawn` `ok`; what was refused stays so. A VPS's clock goes with its flight or unit."""

@@ -69,7 +69,7 @@ class Ledger:
 
     def remember(self, outcomes: Iterable[Outcome], done: Mapping[str, LogEntry]) -> None:
         """Remember a night's flights: the outcomes, all of whose results were kept, and those that were `done`."""
-        flights: dict[str, Seen] = {flight_id: self._flights[flight_id] for flight_id in done}
+        flights: dict[str, Seen] = {known: self._flights[known] for known in done if known in self._flights}
         vehicles = {entry["vehicle_id"] for entry in done.values()}
         for outcome in outcomes:
             vehicles.add(outcome.job.vehicle_id)
