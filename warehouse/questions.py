@@ -63,18 +63,19 @@ def those_asked_for(
     FieldcalError
         `not_found`, with the nearest that there is.
     """
-    if vehicle is not None:
-        known_vehicle(warehouse, vehicle)
     rows = warehouse.scan(table, vehicle_id=vehicle)
+    if vehicle is not None and rows.head(1).collect().is_empty():
+        known_vehicle(warehouse, vehicle)
     for column, wanted in (("sensor", sensor), ("parameter", parameter)):
         if wanted is None:
             continue
+        rows = rows.filter(pl.col(column) == wanted)
+        if not rows.head(1).collect().is_empty():
+            continue
         known = warehouse.scan(table).select(pl.col(column).unique()).collect()[column].to_list()
         if known and wanted not in known:
-            raise FieldcalError(
-                ReasonCode.NOT_FOUND, f"No {column} {wanted!r} is in table {table}; {nearest(wanted, known)}."
-            )
-        rows = rows.filter(pl.col(column) == wanted)
+            told = f"No {column} {wanted!r} is in table {table}; {nearest(wanted, known)}."
+            raise FieldcalError(ReasonCode.NOT_FOUND, told)
     return rows
 
 

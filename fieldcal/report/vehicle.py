@@ -40,7 +40,8 @@ def vehicle_page(root: Path, vehicle_id: str, links: Links, as_of: datetime | No
     """The page, from the history below `root`."""
     warehouse = existing(root)
     flights = warehouse.scan("flight", vehicle_id=vehicle_id).sort(FLOWN_ORDER, nulls_last=False).collect()
-    known_vehicle(warehouse, vehicle_id)
+    if flights.is_empty():
+        known_vehicle(warehouse, vehicle_id)
     moment = as_of or newest(warehouse)
     imus = list(dict.fromkeys(reversed(flights["imu_id"].to_list())))
     flown = units_flown(warehouse, vehicle_id)
