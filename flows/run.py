@@ -51,8 +51,8 @@ def run_night(
             waiting = time.monotonic()
             url = server.wait()
             start_s = imported - starting + time.monotonic() - waiting
-            tidy_prefect(root, url, own_server=server.own)
-            with connected(url):
+            with server.explained(), connected(url):
+                tidy_prefect(root, url, own_server=server.own)
                 kept: list[NightDocument] = []
                 planned = flow_of(night, parallel, progress, processes, kept.append)
                 try:

@@ -20,6 +20,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
 from types import TracebackType
 from typing import Self
 
@@ -42,11 +43,15 @@ from fieldcal.flows.connection import (
 )
 from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.warehouse.errors import WarehouseError, disk
 
 START_TIMEOUT_S = 180.0
 USERS = "server.users"
 LIVES = "server.lives"
 ADDRESS = "server.json"
+DATABASE = "prefect.db"
+ROOM_BYTES = 4_000_000
+"""What a database, or its write-ahead log, grows by in a night, generously."""
 
 QUIET = {
     "DO_NOT_TRACK": "1",
@@ -166,16 +171,40 @@ class Server:
         give_up = time.monotonic() + (START_TIMEOUT_S if self.own else ANSWER_TIMEOUT_S)
         while not answers(self._url):
             if self.own and not is_held(self._home / LIVES):
-                raise FieldcalError(
-                    ReasonCode.PREFECT_UNAVAILABLE,
-                    f"The Prefect server could not start; see {self._home / 'server.log'}.",
-                )
+                raise self._failure("The Prefect server could not start")
             if time.monotonic() > give_up:
                 raise FieldcalError(ReasonCode.PREFECT_UNAVAILABLE, self._silence())
             time.sleep(0.05)
-        need_entry(self._url, of_ours(self._home) if self.own else OF_THE_USER)
+        with self.explained():
+            need_entry(self._url, of_ours(self._home) if self.own else OF_THE_USER)
         self._release_start()
         return self._url
+
+    @contextmanager
+    def explained(self) -> Iterator[None]:
+        """Within the block the server's failures are sentences: what the disk refuses it, else where it tells more.
+
+        Raises
+        ------
+        FieldcalError
+            `disk_full` or what else the disk says; `prefect_unavailable`.
+        """
+        from httpx import HTTPError
+
+        try:
+            yield
+        except HTTPError as error:
+            told = str(error).split(" for url", 1)[0].strip() or type(error).__name__
+            raise self._failure(f"The Prefect server failed ({told})") from error
+
+    def _failure(self, what: str) -> FieldcalError:
+        if not self.own:
+            return FieldcalError(ReasonCode.PREFECT_UNAVAILABLE, f"{what}: {self._url}. Look at its log.")
+        try:
+            _grow_like_its_database(self._home)
+        except WarehouseError as error:
+            return FieldcalError(error.reason_code, f"{what}: {error.sentence}")
+        return FieldcalError(ReasonCode.PREFECT_UNAVAILABLE, f"{what}; see {self._home / 'server.log'}.")
 
     def stop(self) -> None:
         """Use it no longer. A server of ours ends by itself when nobody does."""
@@ -258,6 +287,25 @@ def running_server(root: Path, *, serving: bool = False) -> Iterator[Server]:
     prepare_environment(root, serving=serving)
     with Server(Path(os.environ["PREFECT_HOME"]), serving=serving) as server:
         yield server
+
+
+def _grow_like_its_database(home: Path) -> None:
+    """Write, for a moment, a file that needs as much of the disk as the server's database needs to grow.
+
+    The server itself cannot always tell: where a file may not grow, its log may not either.
+
+    Raises
+    ------
+    WarehouseError
+        What the disk says.
+    """
+    with disk(home / DATABASE, "written"), TemporaryFile(dir=home) as file:
+        length = max((path.stat().st_size for path in home.glob(f"{DATABASE}*")), default=0)
+        file.truncate(length)  # a hole: costs no space, but counts against a limit of a file's length
+        file.seek(length)
+        file.write(bytes(ROOM_BYTES))
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _recorded(home: Path) -> str | None:

@@ -63,7 +63,8 @@ def serve(
         from fieldcal.flows.served import Served
 
         url = server.wait()
-        tidy_prefect(root, url, own_server=server.own)
+        with server.explained():
+            tidy_prefect(root, url, own_server=server.own)
         try:
             runner = register(Served(place, watch, root, config, workers), cron, timezone)
         except ValueError as error:

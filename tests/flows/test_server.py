@@ -36,6 +36,19 @@ with running_server(Path(sys.argv[1])) as server:
     sys.stdin.readline()
 """
 
+FAIL = """
+import resource, sys
+from pathlib import Path
+import httpx
+from fieldcal.flows.server import Server
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
+try:
+    with Server(Path(sys.argv[1])).explained():
+        raise httpx.ConnectError("500 Internal Server Error for url 'http://127.0.0.1'")
+except Exception as error:
+    print(error.reason_code, error.sentence)
+"""
+
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -98,6 +111,24 @@ def test_a_server_that_does_not_answer_is_named(tmp_path: Path, monkeypatch: pyt
         server.wait()
     assert url in caught.value.sentence
     assert caught.value.reason_code == "prefect_unavailable"
+
+
+@pytest.mark.parametrize(
+    ("file_bytes", "reason_code", "told"),
+    [(10_000_000, "disk_full", "ulimit -f"), (30_000_000, "prefect_unavailable", "server.log")],
+)
+def test_a_server_that_fails_is_told_with_what_the_disk_refuses_it(
+    file_bytes: int, reason_code: str, told: str, tmp_path: Path
+) -> None:
+    """Its database could grow by another few MB, or not."""
+    with (tmp_path / "prefect.db").open("wb") as file:
+        file.truncate(9_000_000)
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
+    command = [sys.executable, "-c", FAIL, str(tmp_path), str(file_bytes)]
+    found = subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, check=True).stdout
+    assert found.startswith(f"{reason_code} The Prefect server failed (500 Internal Server Error)")
+    assert told in found
+    assert {path.name for path in tmp_path.iterdir()} == {"prefect.db"}
 
 
 def test_nothing_is_sent_to_others() -> None:
