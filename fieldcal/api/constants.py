@@ -83,13 +83,14 @@ def compare(
     Parameters
     ----------
     constants : Constants or Calibration
-        `Warehouse.calibration_at`, or one flight's own.
+        `Warehouse.what_flies`, `Warehouse.calibration_at`, or one flight's own.
     parameters, logged_raw : optional
         As in `export`; without `parameters` those in the log of an autopilot.
 
     Returns
     -------
     list of Compared
+        `estimate` and `sd` are NaN where nothing is estimated.
 
     Raises
     ------
@@ -107,7 +108,17 @@ def compare(
     ...     print(error.reason_code)
     not_loadable
     """
-    return compared(_constants(constants), Request(_parameters(parameters), logged_raw))[0]
+    return comparison(constants, parameters=parameters, logged_raw=logged_raw)[0]
+
+
+def comparison(
+    constants: Constants | Calibration,
+    *,
+    parameters: Mapping[str, float] | Path | str | None = None,
+    logged_raw: bool = False,
+) -> tuple[list[Compared], tuple[str, ...]]:
+    """`compare`, and what is to be said of sensors that have no place there."""
+    return compared(_constants(constants), Request(_parameters(parameters), logged_raw))
 
 
 def apply(

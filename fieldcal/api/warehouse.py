@@ -163,6 +163,19 @@ class Warehouse(query.Warehouse):
 
         return constants_of(self.root, vehicle, temperature_degc, unit)
 
+    def what_flies(self, vehicle: str, temperature_degc: float | None = None) -> Constants:
+        """`calibration_at`, with where the readings of every sensor on board came from, also without constants of it:
+        for `compare`, which tells what an autopilot has loaded there. Without any constants `triads` is empty.
+
+        Raises
+        ------
+        FieldcalError
+            `no_calibration`: the vehicle is not known.
+        """
+        from fieldcal.exports.calibration_at import what_flies
+
+        return what_flies(self.root, vehicle, temperature_degc)
+
     def withdraw(self, target: str, *, reason: str, author: str | None = None, **part: Unpack[Part]) -> Decided:
         """Decide that a flight, or a part of it, counts nowhere: not in trends, constants to fly with or exports. Its
         rows stay, with status `withdrawn`, also when a night publishes it anew.

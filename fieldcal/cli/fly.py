@@ -106,19 +106,25 @@ def compare(
     """
     from dataclasses import asdict
 
+    from fieldcal.api.constants import comparison
     from fieldcal.cli.show import console, print_json, table
     from fieldcal.exports.autopilots.comparison import COLUMNS, lines
+    from fieldcal.words.talk import say
 
     root = fieldcal.Warehouse(warehouse)
-    constants = root.calibration_at(vehicle, at_temperature)
-    rows = fieldcal.compare(constants, parameters=params, logged_raw=logged_raw)
+    constants = root.what_flies(vehicle, at_temperature)
+    rows, told = comparison(constants, parameters=params, logged_raw=logged_raw)
     exports = root.exports(vehicle)
     if as_json:
         of = {(one.unit_id, one.sensor): asdict(one) for one in exports}
-        finite = [{**asdict(row), "sd": row.sd if row.sd == row.sd else None} for row in rows]
-        print_json([{**row, "exported": of.get((row["unit_id"], row["sensor"]))} for row in finite])
+        as_told = [(row, {k: None if v != v else v for k, v in asdict(row).items()}) for row in rows]
+        print_json([{**cells, "exported": of.get((row.unit_id, row.sensor))} for row, cells in as_told])
         return 0
     console().print(table(COLUMNS, lines(rows), title=f"{vehicle}: what it flies with, and what is estimated"))
+    for sentence in told:
+        say(sentence)
+    if none := sorted({row.sensor for row in rows if row.parameter == "zero" and row.estimate != row.estimate}):
+        print(f'Not estimated: {", ".join(none)}; `fieldcal sql "FROM refusals"` says why.')
     for one in exports:
         print(one.sentence)
     return 0

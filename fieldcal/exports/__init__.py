@@ -10,7 +10,7 @@ from fieldcal.exports.autopilots.ardupilot import ardupilot
 from fieldcal.exports.autopilots.loading import Request
 from fieldcal.exports.autopilots.px4 import px4
 from fieldcal.exports.c_header import c_header
-from fieldcal.exports.calibration import Constants, Export, written
+from fieldcal.exports.calibration import Constants, Export, nominal_scales, written
 from fieldcal.exports.json_document import json_document
 from fieldcal.exports.kalibr import kalibr
 from fieldcal.exports.ros import imu_calib, imu_pipeline, ros
@@ -48,5 +48,7 @@ def export_to(to: str, constants: Constants, request: Request | None = None) -> 
         `not_loadable`: an autopilot cannot take them, or must not without knowing more.
     """
     if to in AUTOPILOTS:
-        return AUTOPILOTS[to](constants, request)
-    return replace(PROGRAMS[to](constants), written=written(constants, HELD[to]))
+        export = AUTOPILOTS[to](constants, request)
+    else:
+        export = replace(PROGRAMS[to](constants), written=written(constants, HELD[to]))
+    return replace(export, warnings=(*export.warnings, *nominal_scales(constants)))

@@ -49,6 +49,8 @@ class Triad:
         Where the numbers come from.
     zero_per_degc_sd : (3,) array
         One standard deviation of zero's slope; infinite where no slope is known, 0 where it is taken as it is.
+    scale_nominal : bool
+        Whether no flight tells Λ, so that it is 1, as the autopilot takes it.
 
     Examples
     --------
@@ -74,6 +76,7 @@ class Triad:
     zero_per_degc2: Array = field(default_factory=lambda: np.zeros(3))
     zero_per_degc3: Array = field(default_factory=lambda: np.zeros(3))
     zero_per_degc_sd: Array = field(default_factory=lambda: np.zeros(3))
+    scale_nominal: bool = False
 
     @property
     def diagonal(self) -> bool:
@@ -159,13 +162,14 @@ class Constants:
     vehicle_id, imu_id : str
         Who.
     triads : mapping of str to Triad
-        Sensor → its constants; a sensor without any is left out.
+        Sensor → its constants; a sensor without any is left out. Of a gyroscope in
+        an autopilot's log its zeros are enough.
     as_of : str
         ISO 8601 of the latest flight that they come from; empty when its clock is unknown.
     unit_ids : mapping of str to str
         Sensor → the unit that its constants belong to; empty where that is not told.
     origins : mapping of str to Origin
-        Sensor → where its readings came from; a sensor of which that is not known is left out.
+        Sensor → where its readings came from, also of a sensor without constants; left out where that is not known.
     further : tuple of Constants
         Those of further units on board, for targets that have a place for each.
     imu_rate_hz : float or None
@@ -257,4 +261,14 @@ def written(constants: Constants, held: Mapping[Sensor, Sequence[str]]) -> tuple
             ),
         )
         if name.partition("_")[0] in held.get(Sensor(sensor), ())
+    )
+
+
+def nominal_scales(constants: Constants) -> tuple[str, ...]:
+    """What is to be said of sensors whose zeros alone are known."""
+    return tuple(
+        f"{sensor}: only its zeros are known; its scales, which no flight tells, are left at 1."
+        for own in (constants, *constants.further)
+        for sensor, triad in own.triads.items()
+        if triad.scale_nominal
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -11,9 +12,10 @@ import numpy as np
 import polars as pl
 
 from fieldcal.errors import FieldcalError
-from fieldcal.exports.calibration import Constants, Triad, cubic_about
+from fieldcal.exports.calibration import Constants, Origin, Triad, cubic_about
 from fieldcal.exports.flights import Flights
-from fieldcal.names import INERTIAL_FIRST
+from fieldcal.geometry.rotation import Array
+from fieldcal.names import INERTIAL_FIRST, Sensor
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import REFERENCE_DEGC
@@ -61,7 +63,9 @@ def constants_of(
 ) -> Constants:
     """Constants at a temperature (default 25 °C) of the primary units that flew last on the vehicle, or of one unit.
 
-    Scale and zero are what is looked up: the two hardly depend on each other, and the offset follows from both.
+    Scale and zero are what is looked up: the two hardly depend on each other, and the offset follows from both. Of a
+    gyroscope in an autopilot's log its zeros are enough: an autopilot has a place for nothing else of it, and ordinary
+    flights hardly show its scales.
 
     Raises
     ------
@@ -87,7 +91,7 @@ def constants_of(
         raise FieldcalError(ReasonCode.NO_CALIBRATION, f"No calibration of vehicle {vehicle_id!r} is known{told}.")
     flights = Flights(warehouse, vehicle_id)
     constants = _constants(vehicle_id, own, at, flights)
-    if constants is None:
+    if not constants.triads:
         raise FieldcalError(
             ReasonCode.NO_CALIBRATION,
             f'No sensor of {vehicle_id!r} has all its axes calibrated; `fieldcal sql "FROM refusals"` says why.',
@@ -95,30 +99,66 @@ def constants_of(
     if unit_id is not None:
         return constants
     beside = [rows.filter(pl.col("unit_id") == one) for one in flights.further]
-    further = [one for part in beside if (one := _constants(vehicle_id, part, at, flights)) is not None]
-    return replace(constants, further=tuple(further))
+    further = [_constants(vehicle_id, part, at, flights) for part in beside if not part.is_empty()]
+    return replace(constants, further=tuple(one for one in further if one.triads))
 
 
-def _constants(vehicle_id: str, rows: pl.DataFrame, at: float, flights: Flights) -> Constants | None:
-    """Constants from the rows of units; None where no sensor has all its axes."""
-    triads: dict[str, Triad] = {
-        s: triad for s in INERTIAL_FIRST if (triad := _triad(rows.filter(sensor=s), at)) is not None
+def what_flies(root: Path, vehicle_id: str, temperature_degc: float | None = None) -> Constants:
+    """`constants_of` the units that flew last, with the origin of every sensor, also of those without constants; no
+    triads where none has any.
+
+    Raises
+    ------
+    FieldcalError
+        `no_calibration`: the vehicle is not known.
+    """
+    warehouse = existing(root)
+    flights = Flights(warehouse, vehicle_id)
+    flown = units_flown(warehouse, vehicle_id).rows(named=True)
+    try:
+        known = constants_of(root, vehicle_id, temperature_degc)
+    except FieldcalError as error:
+        if error.reason_code != ReasonCode.NO_CALIBRATION or not flown:
+            raise
+        known = Constants(vehicle_id, flown[0]["imu_id"], {}, "")
+    missing = [one for one in flown if one["sensor"] not in known.triads]
+    origins = {
+        one["sensor"]: flights.origin(one["sensor"], flights.latest(one["sensor"], one["unit_id"])) for one in missing
     }
-    if not triads:
-        return None
+    return replace(
+        known,
+        unit_ids={**known.unit_ids, **{one["sensor"]: one["unit_id"] for one in missing}},
+        origins={**known.origins, **{sensor: origin for sensor, origin in origins.items() if origin is not None}},
+    )
+
+
+def _constants(vehicle_id: str, rows: pl.DataFrame, at: float, flights: Flights) -> Constants:
+    """Constants from the rows of units; without triads where no sensor has all its axes."""
+    origins: dict[str, Origin] = {}
+    triads: dict[str, Triad] = {}
+    for sensor in INERTIAL_FIRST:
+        if (own := rows.filter(sensor=sensor)).is_empty():
+            continue
+        origin = flights.origin(sensor, own)
+        holds_zeros_alone = sensor == Sensor.GYROSCOPE and origin is not None and origin.loaded is not None
+        if (triad := _triad(own, at, scale_needed=not holds_zeros_alone)) is not None:
+            triads[sensor] = triad
+            if origin is not None:
+                origins[sensor] = origin
     last = rows.sort(FLOWN_ORDER, nulls_last=False).row(-1, named=True)
     as_of = "" if last["started_at"] is None else last["started_at"].isoformat()
     ids = {s: str(rows.filter(sensor=s)["unit_id"][0]) for s in triads}
-    origins = {s: origin for s in triads if (origin := flights.origin(s, rows.filter(sensor=s))) is not None}
     rate_hz = flights.imu_rate_hz(str(last["flight_id"]))
     return Constants(vehicle_id, str(last["imu_id"]), triads, as_of, ids, origins, imu_rate_hz=rate_hz)
 
 
-def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
-    """One sensor's constants; None unless every axis has both scale and zero."""
+def _triad(rows: pl.DataFrame, at: float, *, scale_needed: bool) -> Triad | None:
+    """One sensor's constants; None unless every axis has a zero and, where it is needed, a scale."""
     found = {(row["parameter"], row["axis"]): row for row in typed(rows.iter_rows(named=True), _Axis)}
-    if any((parameter, axis) not in found for parameter in ("scale", "zero") for axis in AXES):
+    if any(("zero", axis) not in found for axis in AXES):
         return None
+    if any(("scale", axis) not in found for axis in AXES):
+        return None if scale_needed else _zeros_alone(found, at)
     full = all(
         (row := found.get(("scale", a + b))) is not None and row["flight_id"] == found["scale", a]["flight_id"]
         for a in AXES
@@ -133,17 +173,7 @@ def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
         values = [found[parameter, axis][column] for axis in AXES]
         return np.array([unknown if v is None else v for v in values], dtype=float)
 
-    # The curve about 25 °C, brought to the temperature that is asked for.
-    first, second, third = (vector("zero", c) for c in _CURVE)
-    slope, square, cube = cubic_about(first, second, third, at - REFERENCE_DEGC)
-    spans = [
-        (low, high)
-        for row in found.values()
-        if row["slope_per_degc"] is not None
-        and (low := row["temperature_min_degc"]) is not None
-        and (high := row["temperature_max_degc"]) is not None
-    ]
-    flown = (max(low for low, _ in spans), min(high for _, high in spans)) if spans else None
+    slope, square, cube = _zero_over_temperature(found, at)
     return Triad(
         scale=matrix("value"),
         zero=vector("zero", "value"),
@@ -157,11 +187,52 @@ def _triad(rows: pl.DataFrame, at: float) -> Triad | None:
         unit=_calibrated_unit(found),
         logged_unit=str(found["zero", "x"]["unit"]),
         temperature_degc=at,
-        flown_degc=flown,
+        flown_degc=_flown_degc(found.values()),
         why=tuple(
             f"{parameter} {axis}: {found[parameter, axis]['why']}" for parameter in ("scale", "zero") for axis in AXES
         ),
     )
+
+
+def _zeros_alone(found: Mapping[tuple[str, str], _Axis], at: float) -> Triad:
+    """A sensor whose scales are 1 by its unit, as no flight tells them."""
+    zeros = [found["zero", axis] for axis in AXES]
+    slope, square, cube = _zero_over_temperature(found, at)
+    return Triad(
+        scale=np.eye(3),
+        zero=np.array([row["value"] for row in zeros]),
+        scale_per_degc=np.zeros((3, 3)),
+        zero_per_degc=slope,
+        zero_per_degc2=square,
+        zero_per_degc3=cube,
+        zero_per_degc_sd=_slope_sd(zeros),
+        scale_sd=np.full(3, np.nan),
+        zero_sd=np.array([np.nan if row["sd"] is None else row["sd"] for row in zeros]),
+        unit=str(zeros[0]["unit"]),
+        logged_unit=str(zeros[0]["unit"]),
+        temperature_degc=at,
+        flown_degc=_flown_degc(zeros),
+        why=("scale: no flight tells it; 1", *(f"zero {axis}: {found['zero', axis]['why']}" for axis in AXES)),
+        scale_nominal=True,
+    )
+
+
+def _zero_over_temperature(found: Mapping[tuple[str, str], _Axis], at: float) -> tuple[Array, Array, Array]:
+    """Slope and bend of the zeros: the curve about 25 °C, brought to the temperature that is asked for."""
+    first, second, third = (np.array([_or_zero(found["zero", axis][column]) for axis in AXES]) for column in _CURVE)
+    return cubic_about(first, second, third, at - REFERENCE_DEGC)
+
+
+def _flown_degc(rows: Iterable[_Axis]) -> tuple[float, float] | None:
+    """The temperatures that all trends cover; None without a slope."""
+    spans = [
+        (low, high)
+        for row in rows
+        if row["slope_per_degc"] is not None
+        and (low := row["temperature_min_degc"]) is not None
+        and (high := row["temperature_max_degc"]) is not None
+    ]
+    return (max(low for low, _ in spans), min(high for _, high in spans)) if spans else None
 
 
 def _slope_sd(rows: list[_Axis]) -> np.ndarray:

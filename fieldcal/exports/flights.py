@@ -36,6 +36,12 @@ class Flights:
         own = rows.filter(pl.col("flight_id") == latest["flight_id"][0], ~pl.col("is_primary"))
         return own.select("unit_id").unique().sort("unit_id").collect()["unit_id"].to_list()
 
+    def latest(self, sensor: str, unit_id: str) -> pl.DataFrame:
+        """Rows of a unit's sensor in the latest flight that counts, for `origin`, whether calibrated or refused."""
+        rows = self._warehouse.scan("calibration", vehicle_id=self._vehicle_id)
+        rows = rows.filter(counting(self._warehouse.root), pl.col("sensor") == sensor, pl.col("unit_id") == unit_id)
+        return rows.sort(FLOWN_ORDER, nulls_last=False).tail(1).collect()
+
     def origin(self, sensor: str, rows: pl.DataFrame) -> Origin | None:
         """Where a sensor's readings came from in the latest flight among rows of it; None where the history does not
         tell, as one of before this was kept.

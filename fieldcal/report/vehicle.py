@@ -10,7 +10,7 @@ import polars as pl
 
 from fieldcal.errors import FieldcalError
 from fieldcal.exports.autopilots.comparison import COLUMNS, compared, lines
-from fieldcal.exports.calibration_at import constants_of
+from fieldcal.exports.calibration_at import what_flies
 from fieldcal.exports.handed_out import handed_out
 from fieldcal.names import GRAVEST_FIRST, SENSORS, DriftStatus, Status
 from fieldcal.report.history import LatestCalibration, RefusedRow, as_of_sentence, newest, reason_of, usable_flights
@@ -132,7 +132,7 @@ def _sources(by_axis: Mapping[str, LatestCalibration]) -> str:
 def _before_and_after(root: Path, vehicle_id: str) -> list[Part]:
     """What its autopilot flies with, where the logs tell."""
     try:
-        rows, _ = compared(constants_of(root, vehicle_id))
+        rows, _ = compared(what_flies(root, vehicle_id))
     except FieldcalError:
         return []
     numeric = ("flies with", "estimate", "difference", "which is")

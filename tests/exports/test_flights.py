@@ -139,6 +139,63 @@ def test_compare_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert json.loads(capsys.readouterr().out)[0]["matters"] is False
 
 
+def without_scales(root: Path) -> Path:
+    """An autopilot's flight that shows the gyroscope's zeros only, its accelerometer refused."""
+    first = lead("v", "f1", 1) | {"unit_id": "b/12"}
+    zeros = [row for row in gyroscope(first, 0.03) if row["parameter"] == "zero"]
+    refused = [
+        row
+        | {"sensor": "accelerometer", "status": "refused", "reason_code": "too_few_poses", "reason": "too few poses"}
+        for row in gyroscope(first, 0.03)
+    ]
+    told = origin(12)
+    told["loaded"]["accelerometer"] = {
+        **told["loaded"]["gyroscope"],
+        "device_id": 7,
+        "parameters": {"CAL_ACC0_ID": 7.0, "CAL_ACC0_XOFF": 0.3, "CAL_ACC0_ZSCALE": 0.98},
+    }
+    return history(root, (zeros + refused, [composition(first, told)]))
+
+
+def test_zeros_are_enough_for_an_autopilots_gyroscope(tmp_path: Path) -> None:
+    constants = constants_of(without_scales(tmp_path), "v")
+    triad = constants.triads[Sensor.GYROSCOPE]
+    assert triad.scale_nominal
+    np.testing.assert_array_equal(triad.scale, np.eye(3))
+    assert np.isnan(triad.scale_sd).all()
+    assert np.isfinite(triad.zero_sd).all()
+    for to, name in (("px4", "CAL_GYRO1_XOFF\t0.03\t"), ("json", '"zero": [')):
+        export = fieldcal.export(constants, to)
+        assert name in export.text
+        assert any("only its zeros are known" in told for told in export.warnings)
+
+
+def test_zeros_are_not_enough_where_no_autopilot_tells_what_the_scale_is(tmp_path: Path) -> None:
+    first = lead("v", "f1", 1) | {"unit_id": "b/12"}
+    zeros = [row for row in gyroscope(first, 0.03) if row["parameter"] == "zero"]
+    told = origin(12)
+    told["loaded"] = {}
+    root = history(tmp_path, (zeros, [composition(first, told)]))
+    with pytest.raises(fieldcal.FieldcalError, match="has all its axes calibrated"):
+        constants_of(root, "v")
+
+
+def test_what_flies_is_told_without_an_estimate_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = without_scales(tmp_path)
+    rows = fieldcal.compare(fieldcal.Warehouse(root).what_flies("v"))
+    own = {(row.sensor, row.parameter, row.axis): row for row in rows}
+    assert own["accelerometer", "zero", "x"].flies_with == pytest.approx(0.3)
+    assert own["accelerometer", "scale", "z"].flies_with == pytest.approx(0.98)
+    assert np.isnan(own["accelerometer", "scale", "z"].estimate)
+    assert own["gyroscope", "zero", "x"].estimate == pytest.approx(0.03)
+    assert ("gyroscope", "scale", "x") not in own
+    assert run(["compare", "v", "--warehouse", str(root)]) == 0
+    assert "Not estimated: accelerometer" in capsys.readouterr().out
+    assert run(["compare", "v", "--warehouse", str(root), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert {row["estimate"] for row in told if row["sensor"] == "accelerometer"} == {None}
+
+
 def test_the_vehicles_page_shows_the_same_table(tmp_path: Path) -> None:
     page = write_vehicle_report(two_units(tmp_path), "v").read_text()
     assert "What the autopilot flew with" in page

@@ -16,11 +16,10 @@ from fieldcal.config.flight_settings import STANDARD_GRAVITY_MPS2
 from fieldcal.errors import FieldcalError
 from fieldcal.exports.autopilots.affine import rotation_and_symmetric
 from fieldcal.exports.autopilots.ardupilot_slot import ArduPilot
-from fieldcal.exports.autopilots.loading import Loadable, Request, Slots, loadable
+from fieldcal.exports.autopilots.loading import Loadable, Request, Slots, loadable, unchanged, without_constants
 from fieldcal.exports.autopilots.px4_slot import Px4
 from fieldcal.exports.autopilots.units import SHOWN_UNIT
-from fieldcal.exports.calibration import Constants, Triad
-from fieldcal.geometry.rotation import Array
+from fieldcal.exports.calibration import Constants
 from fieldcal.names import Sensor
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.tables import AXES
@@ -37,6 +36,7 @@ of course."""
 SURE_SD = 2.0
 """And beyond so many standard deviations."""
 ROUNDING = 1e-9
+NONE = "–"
 COLUMNS = ("sensor", "axis", "of", "flies with", "estimate", "difference", "which is", "parameter", "matters")
 
 
@@ -53,7 +53,7 @@ class Compared:
     name : str or None
         The autopilot's parameter that would change; None where it has no place for it.
     flies_with, estimate, sd : float
-        In `unit`; sd NaN where it is not known.
+        In `unit`; sd NaN where it is not known, both where there is no estimate.
     unit : str
     effect : float or None
         What the difference does, in `effect_unit`; None where that is not known.
@@ -83,7 +83,7 @@ class Compared:
 
 
 def compared(constants: Constants, request: Request | None = None) -> tuple[list[Compared], tuple[str, ...]]:
-    """Every constant of every unit whose autopilot's parameters are known; and what is to be said.
+    """Every constant of every unit whose autopilot's parameters are known, estimated or not; and what is to be said.
 
     Raises
     ------
@@ -92,13 +92,21 @@ def compared(constants: Constants, request: Request | None = None) -> tuple[list
     """
     asked = request or Request()
     target = TARGETS[_autopilot(constants, asked)]
-    found, told = loadable(constants, target, asked)
     rows: list[Compared] = []
+    found: list[Loadable] = []
+    try:
+        found, told = loadable(constants, target, asked)
+    except FieldcalError as error:
+        told = [error.sentence]
     for one in found:
         if not one.parameters:
             why = f"{one.sensor}: what it flies with is not known; give --params."
             raise FieldcalError(ReasonCode.NOT_LOADABLE, why)
         rows += _of_sensor(one, target)
+    for one in without_constants(constants, target, asked, found):
+        rows += _of_sensor(one, target, estimated=False)
+    if not rows:
+        raise FieldcalError(ReasonCode.NOT_LOADABLE, " ".join(told))
     return rows, tuple(told)
 
 
@@ -110,11 +118,11 @@ def lines(rows: Sequence[Compared]) -> list[list[str]]:
             row.axis,
             f"{row.parameter}, {row.unit}" if row.unit else row.parameter,
             number(row.flies_with),
-            with_sd(row.estimate, row.sd if np.isfinite(row.sd) else None),
-            number(_shown(row.estimate - row.flies_with), 3),
-            "–" if row.effect is None else f"{number(_shown(row.effect), 3)} {row.effect_unit}",
+            with_sd(row.estimate, row.sd if np.isfinite(row.sd) else None) if np.isfinite(row.estimate) else NONE,
+            number(_shown(row.estimate - row.flies_with), 3) if np.isfinite(row.estimate) else NONE,
+            NONE if row.effect is None else f"{number(_shown(row.effect), 3)} {row.effect_unit}",
             row.name or "none",
-            "yes" if row.matters else "no",
+            ("yes" if row.matters else "no") if np.isfinite(row.estimate) else NONE,
         ]
         for row in rows
     ]
@@ -140,8 +148,9 @@ def _autopilot(constants: Constants, request: Request) -> str:
     )
 
 
-def _of_sensor(one: Loadable, target: Slots) -> list[Compared]:
-    flown = target.raw(_as_they_are(one.triad), one.sensor, one.slot, one.parameters)
+def _of_sensor(one: Loadable, target: Slots, *, estimated: bool = True) -> list[Compared]:
+    as_it_is = unchanged(one.triad.unit, one.triad.temperature_degc)
+    flown = target.raw(as_it_is, one.sensor, one.slot, one.parameters)
     scale, there = one.triad.scale, flown.scale
     if one.sensor == Sensor.MAGNETOMETER:
         scale = rotation_and_symmetric(scale)[1]
@@ -151,8 +160,14 @@ def _of_sensor(one: Loadable, target: Slots) -> list[Compared]:
         zero = size * one.triad.zero[i], size * flown.zero[i], size * one.triad.zero_sd[i]
         factor = scale[i, i], there[i, i], one.triad.scale_sd[i]
         for what, (estimate, loaded, sd), shown in (("zero", zero, SHOWN_UNIT[one.sensor]), ("scale", factor, "")):
+            if what == "scale" and one.triad.scale_nominal:
+                continue
+            if not estimated:
+                estimate, sd = np.nan, np.nan
             effect, effect_unit = _effect(one.sensor, what, abs(estimate - loaded), one.horizontal_field_g)
             sure = not np.isfinite(sd) or abs(estimate - loaded) > SURE_SD * sd
+            if not np.isfinite(estimate):
+                effect, effect_unit = None, ""
             rows.append(
                 Compared(
                     str(one.sensor),
@@ -184,21 +199,3 @@ def _effect(sensor: Sensor, what: str, difference: float, field_g: float | None)
     if what == "scale":
         return float(np.rad2deg(0.5 * difference)), "° of heading"
     return (None if not field_g else float(np.rad2deg(np.arctan2(difference, field_g)))), "° of heading"
-
-
-def _as_they_are(triad: Triad) -> Triad:
-    """Constants that leave readings as the autopilot made them."""
-    nothing: Array = np.zeros(3)
-    return Triad(
-        scale=np.eye(3),
-        zero=nothing,
-        scale_per_degc=np.zeros((3, 3)),
-        zero_per_degc=nothing,
-        scale_sd=nothing,
-        zero_sd=nothing,
-        unit=triad.unit,
-        logged_unit=triad.logged_unit,
-        temperature_degc=triad.temperature_degc,
-        flown_degc=None,
-        why=(),
-    )

@@ -9,7 +9,7 @@ they are, make a sensor worse.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
@@ -18,12 +18,13 @@ import numpy as np
 from fieldcal.config.loaded import Loaded
 from fieldcal.errors import FieldcalError
 from fieldcal.exports.autopilots.affine import angle_deg
-from fieldcal.exports.autopilots.units import in_autopilot_units
+from fieldcal.exports.autopilots.units import SHOWN_UNIT, in_autopilot_units
 from fieldcal.exports.calibration import Constants, Origin, Triad
 from fieldcal.geometry.frames import FRD_FROM_FLU
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import INERTIAL_FIRST, Sensor
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas.reference import REFERENCE_DEGC
 
 LEAST_TURN_DEG = 0.01
 FIRST_SLOT = 0
@@ -135,6 +136,52 @@ def loadable(constants: Constants, target: Slots, request: Request) -> tuple[lis
     if not found:
         raise FieldcalError(ReasonCode.NOT_LOADABLE, f"Nothing to load into {target.title}. {' '.join(told)}")
     return found, told
+
+
+def without_constants(
+    constants: Constants, target: Slots, request: Request, found: Sequence[Loadable]
+) -> Iterator[Loadable]:
+    """Slots of sensors that are not among those `found`, as their logs tell: with what is loaded, and a triad that
+    leaves readings as the autopilot makes them."""
+    for sensor in INERTIAL_FIRST:
+        origin = constants.origins.get(sensor)
+        if origin is None or (loaded := origin.loaded) is None or loaded.autopilot != target.name:
+            continue
+        if any(one.sensor == sensor for one in found):
+            continue
+        parameters = loaded.parameters if request.parameters is None else request.parameters
+        try:
+            slot, device_id = _slot(sensor, loaded.device_id, target, parameters)
+        except _LeftOut:
+            continue
+        at_degc = REFERENCE_DEGC if origin.temperature_degc is None else origin.temperature_degc
+        yield Loadable(
+            sensor,
+            unchanged(SHOWN_UNIT[sensor], at_degc),
+            slot,
+            device_id,
+            parameters,
+            constants.unit_ids.get(sensor, ""),
+            origin.horizontal_field_g,
+        )
+
+
+def unchanged(unit: str, temperature_degc: float) -> Triad:
+    """Constants that leave readings as they are."""
+    nothing: Array = np.zeros(3)
+    return Triad(
+        scale=np.eye(3),
+        zero=nothing,
+        scale_per_degc=np.zeros((3, 3)),
+        zero_per_degc=nothing,
+        scale_sd=nothing,
+        zero_sd=nothing,
+        unit=unit,
+        logged_unit=unit,
+        temperature_degc=temperature_degc,
+        flown_degc=None,
+        why=(),
+    )
 
 
 def _place(
