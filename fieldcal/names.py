@@ -133,6 +133,8 @@ class Verdict(StrEnum):
     OK = "ok"
     PARTIAL = "partial"
     """Something is missing of it; the rest counts."""
+    NO_RESULT = "no_result"
+    """It was read, and no constant came out of it."""
     QUARANTINED = "quarantined"
     """It contradicts itself; nothing of it is published."""
     REJECTED = "rejected"
@@ -141,7 +143,7 @@ class Verdict(StrEnum):
     @property
     def usable(self) -> bool:
         """Whether stages run on it."""
-        return self in (Verdict.OK, Verdict.PARTIAL)
+        return self in (Verdict.OK, Verdict.PARTIAL, Verdict.NO_RESULT)
 
 
 class DriftStatus(StrEnum):

@@ -205,7 +205,8 @@ VERDICT = Column(
     "verdict",
     _TEXT,
     "",
-    "ok: all read, no stage failed; partial: samples lost; quarantined: contradictory; rejected: nothing usable",
+    "ok: all read, no stage failed; partial: samples lost; no_result: no constant came out of it; quarantined: "
+    "contradictory; rejected: nothing usable",
 )
 FINDINGS = Column("findings", _TEXT, "", "what was found in the log, JSON list of {code, count, sentence}")
 VERIFIABLE = Column("verifiable", _FLAG, "", "whether the log carries checksums that were checked")

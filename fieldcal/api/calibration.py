@@ -82,8 +82,8 @@ class Calibration:
     ----------
     recording : Recording
         What was calibrated.
-    verdict : {"ok", "partial", "quarantined", "rejected"}
-        The recording's, "partial" also where a stage failed.
+    verdict : {"ok", "partial", "no_result", "quarantined", "rejected"}
+        The recording's; "partial" also where a stage failed, "no_result" where no constant came out of it.
     reason : str or None
         Why it is not "ok".
     rows : DataFrame

@@ -63,6 +63,7 @@ class NightSummary(TypedDict):
 
     ok: int
     partial: int
+    no_result: int
     quarantined: int
     rejected: int
     stages_run: int

@@ -121,6 +121,7 @@ def summary(
     return {
         "ok": counts[Verdict.OK],
         "partial": counts[Verdict.PARTIAL],
+        "no_result": counts[Verdict.NO_RESULT],
         "quarantined": counts[Verdict.QUARANTINED],
         "rejected": counts[Verdict.REJECTED],
         "stages_run": sum(len(outcome.ran) for outcome in outcomes),

@@ -178,7 +178,7 @@ class SanitySettings(NominalScale, Units, LocalField, Gravity):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ManoeuvreSettings(StageSettings):
+class ManoeuvreSettings(NominalScale):
     """Stage `manoeuvre`."""
 
     manoeuvre_window_s: float

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fieldcal.estimation.segments import run_bounds
+from fieldcal.estimation.segments import run_bounds, run_starts
 from fieldcal.estimation.statistics import MAD_TO_SIGMA
 from fieldcal.geometry.rotation import Array
 
 REST_SHARE = 0.02  # of the sustained level: slower is rest
+TURNED_WITHIN_S = 10.0
+"""How far a vehicle was turned is judged within so long: a zero of 1°/s that the median leaves makes 10° of it."""
 BURST_S = 3.0
 """A log that turns hard for so long and not for `min_s` is judged by that: its rest is no motion."""
 
@@ -60,6 +62,35 @@ def windowed_rate(t: ArrayLike, rate: ArrayLike, window_s: float, smooth_s: floa
     smoothed = _running_mean(centred, short)
     power = _running_mean(np.sum(smoothed**2, axis=1, keepdims=True), max(1, round(window_s / interval)))[:, 0]
     return np.sqrt(np.maximum(power, 0.0)), noise
+
+
+def turned_within(t: ArrayLike, rate: ArrayLike, window_s: float = TURNED_WITHIN_S, max_gap_s: float = 0.1) -> Array:
+    """By how much a vehicle was turned about each of its axes, to and fro, within `window_s` at most.
+
+    Parameters
+    ----------
+    t : (n,) array
+        Stamps, s.
+    rate : (n, 3) array
+        rad/s; its median counts as zero.
+    max_gap_s : float
+        Over longer pauses nothing is integrated.
+
+    Returns
+    -------
+    (3,) array
+        rad: the largest range of the integrated rate among windows that begin every half of `window_s`.
+    """
+    t, rate = np.asarray(t, dtype=float), np.asarray(rate, dtype=float)
+    dt = np.diff(t, prepend=t[:1])
+    dt = np.where((dt > 0.0) & (dt <= max_gap_s), dt, 0.0)
+    angle = np.cumsum((rate - np.median(rate, axis=0)) * dt[:, None], axis=0)
+    half = ((t - t[0]) / (0.5 * window_s)).astype(np.int64)
+    starts = run_starts(half)
+    low, high = np.minimum.reduceat(angle, starts), np.maximum.reduceat(angle, starts)
+    beside = np.diff(half[starts]) == 1
+    both = np.maximum(high[1:], high[:-1])[beside] - np.minimum(low[1:], low[:-1])[beside]
+    return np.asarray(np.max(np.concatenate([high - low, both]), axis=0))
 
 
 def _running_mean(x: Array, width: int) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from typing import cast
 
 import numpy as np
 import polars as pl
@@ -16,11 +17,16 @@ from fieldcal.flight.when import when
 from fieldcal.logs.facts import Facts, FindingFacts
 from fieldcal.logs.on_board import PRIMARY
 from fieldcal.names import Json, Sensor, Status, Verdict
+from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.rows import FlightLead, FlightRow, RunRow, UnitLead
+from fieldcal.stages.composition import PUBLISHED_ROWS
 from fieldcal.stages.pipeline import PUBLISHED
+from fieldcal.stages.preparation import TURNED_DEG
 from fieldcal.stages.stage import stage_and_unit
 from fieldcal.warehouse.store import empty_frame, frame
+from fieldcal.words.flights import is_consequence, no_result
 
+COMPOSITION, MANOEUVRE = "composition", "manoeuvre"
 LEAD_SCHEMA = pl.Schema(
     {
         "flight_id": pl.String(),
@@ -92,7 +98,8 @@ def run_rows(leading: FlightLead, units: Sequence[Unit], records: Mapping[str, S
 
 
 def judged(facts: Facts, records: Mapping[str, StepRecord]) -> Facts:
-    """The facts with what the stages found: a stage that failed makes an `ok` log `partial`, faults are findings."""
+    """The facts with what the stages found: a stage that failed makes an `ok` log `partial`, faults are findings; of a
+    log that gave no constant the verdict is `no_result`, with the reason and what would help."""
     faults = [fault for step, record in records.items() for fault in _faults(step, record["measured"])]
     facts = {**facts, "findings": [*facts["findings"], *faults]}
     failed = [record for record in records.values() if record["status"] == Status.FAILED]
@@ -103,7 +110,29 @@ def judged(facts: Facts, records: Mapping[str, StepRecord]) -> Facts:
             "reason_code": failed[0]["reason_code"],
             "reason": failed[0]["reason"],
         }
+    if Verdict(facts["verdict"]).usable and not failed and _published(records) == 0:
+        causes = [refusal for refusal in refusals(records) if not is_consequence(refusal)]
+        causes = [refusal for refusal in causes if refusal["reason_code"] != ReasonCode.NOTHING_CALIBRATED]
+        reasons = [refusal["reason"] for refusal in causes if refusal["reason"]]
+        code = causes[0]["reason_code"] if causes else ReasonCode.NOTHING_CALIBRATED
+        return {
+            **facts,
+            "verdict": Verdict.NO_RESULT,
+            "reason_code": code,
+            "reason": no_result(reasons, _turned(records)),
+        }
     return facts
+
+
+def _published(records: Mapping[str, StepRecord]) -> int | None:
+    """How many constants were not refused; None while the stages have not run."""
+    found = [record for step, record in records.items() if stage_and_unit(step)[0] == COMPOSITION]
+    return sum(cast(int, record["measured"].get(PUBLISHED_ROWS, 0)) for record in found) if found else None
+
+
+def _turned(records: Mapping[str, StepRecord]) -> Sequence[float] | None:
+    """By how much the vehicle turned about each axis, degrees; None where that is not known."""
+    return cast("Sequence[float] | None", records.get(MANOEUVRE, {"measured": {}})["measured"].get(TURNED_DEG))
 
 
 def refusals(records: Mapping[str, StepRecord]) -> list[Refusal]:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 COMPOSED = ("scale", "bias", "zero", "zero_bias")
 ORIGIN = "origin"
 """Among what the stage measured: where its readings come from."""
+PUBLISHED_ROWS = "published_rows"
+"""And how many constants were not refused."""
 SQUARE = 1e-9
 """Off-diagonal share of a matrix that is rounding."""
 
@@ -57,8 +59,14 @@ def compose(tables: Tables, s: CompositionSettings) -> StageResult:
             out.append(of_raw if is_known[sensor] else _not_known(of_raw))
             residual = of_method.filter(pl.col("parameter").is_in([*COMPOSED, ZERO_SLOPE]))
             out.append(residual.with_columns(parameter=pl.lit(RESIDUAL) + pl.col("parameter")))
-    measured: dict[str, Json] = {ORIGIN: _origin(s), **({"composed": composed} if composed else {})}
-    return StageResult({"calibration": pl.concat(out)}, measured=measured)
+    rows = pl.concat(out)
+    published = rows.filter((pl.col("status") == Status.OK) & pl.col("value").is_not_null()).height
+    measured: dict[str, Json] = {
+        ORIGIN: _origin(s),
+        PUBLISHED_ROWS: published,
+        **({"composed": composed} if composed else {}),
+    }
+    return StageResult({"calibration": rows}, measured=measured)
 
 
 def _origin(s: CompositionSettings) -> dict[str, Json]:

@@ -12,7 +12,7 @@ from fieldcal.estimation import motion_selection, smoothing
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.geometry.intervals import interval_of
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import Status
+from fieldcal.names import Json, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.results import StageResult
@@ -21,6 +21,8 @@ from fieldcal.stages.tables import columns_of, matrix, seconds, triad
 if TYPE_CHECKING:
     from fieldcal.config.stage_settings import ManoeuvreSettings, SmoothingSettings
 
+TURNED_DEG = "turned_deg"
+"""Among what stage `manoeuvre` measured: `turned_within` about each axis, degrees."""
 SHORTEST_STRETCH = 10
 MAGNETOMETER_GAP_S = 0.1
 MAGNETOMETER_GAP_INTERVALS = 5.0
@@ -65,7 +67,7 @@ def find_manoeuvre(tables: Tables, s: ManoeuvreSettings) -> StageResult:
         }
     )
     used_s = float(sum(t[g.stop - 1] - t[g.start] for g in found.segments if g.used))
-    measured = {
+    measured: dict[str, Json] = {
         "excited_s": found.excited_s,
         "used_s": used_s,
         "log_s": float(t[-1] - t[0]),
@@ -74,6 +76,10 @@ def find_manoeuvre(tables: Tables, s: ManoeuvreSettings) -> StageResult:
         "rate_threshold": found.threshold,
         "rate_noise": found.noise,
     }
+    unit = s.nominal_scale[Sensor.GYROSCOPE]
+    if rate_or_none is not None and unit is not None:
+        turned = motion_selection.turned_within(t, rate * np.asarray(unit), max_gap_s=s.manoeuvre_max_gap_s)
+        measured[TURNED_DEG] = [float(angle) for angle in np.rad2deg(turned)]
     if found.excited_s < s.manoeuvre_min_s:
         return StageResult(
             {"segments": segments.with_columns(used=pl.lit(False))},

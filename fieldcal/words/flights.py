@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from fieldcal.estimation.motion_selection import TURNED_WITHIN_S
 from fieldcal.names import Decision, Status, Verdict
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.rows import DecisionRow, Refusable, SyncRow, UnfoldedFlight, UnfoldedRun
+from fieldcal.stages.tables import AXES
 from fieldcal.words.numbers import number, with_sd
 
+MOST_REASONS = 2
+WANTED_DEG = 90.0
+"""Of rotation about an axis, to and fro: ±45° of tilt determine a scale to half a per cent."""
 QUANTITIES = {
     "attitude": "attitude",
     "quaternion_rate": "quaternion rate",
@@ -18,7 +23,7 @@ QUANTITIES = {
 
 
 def verdict_sentence(flight: UnfoldedFlight) -> str:
-    """What became of the log, in a line."""
+    """What became of the log, in a line; why is told beside it."""
     head = f"{flight['log_uri']} ({flight['vehicle_id']}, flight {flight['flight_id']}): {flight['verdict']}"
     if Verdict(flight["verdict"]).usable:
         rates = f"{flight['duration_s']:.1f} s, IMU at {flight['imu_rate_hz']:.0f} Hz"
@@ -27,13 +32,27 @@ def verdict_sentence(flight: UnfoldedFlight) -> str:
         if flight["temperature_mean_degc"] is not None:
             rates += f", {flight['temperature_mean_degc']:.1f} °C"
         head += f"; {rates}"
-    return head + (f"\n  {flight['reason']}" if flight["reason"] else "")
+    return head
 
 
 def advised(runs: Sequence[UnfoldedRun]) -> list[str]:
     """What would make weak constants better, by the stages that found them (a refused stage says it in its reason)."""
     told = (run["measured"].get("advice") for run in runs if run["status"] == Status.OK)
     return [str(advice) for advice in told if advice]
+
+
+def no_result(reasons: Sequence[str], turned_deg: Sequence[float] | None) -> str:
+    """Why a log gave no constant: what the stages that refused it said, each once, and the motion that was wanting."""
+    own = list(dict.fromkeys(reasons)) or ["No sensor could be calibrated."]
+    told = [*own[:MOST_REASONS], *(["Further reasons: view refusals."] if len(own) > MOST_REASONS else [])]
+    if turned_deg is not None and min(turned_deg) < WANTED_DEG:
+        short = [axis for axis, turned in zip(AXES, turned_deg, strict=True) if turned < WANTED_DEG]
+        by = ", ".join(f"{turned:.0f}° about {axis}" for axis, turned in zip(AXES, turned_deg, strict=True))
+        told.append(
+            f"Within {TURNED_WITHIN_S:.0f} s it turned by at most {by}: turn it by {WANTED_DEG:.0f}° or more, to and"
+            f" fro, about {', '.join(short)}."
+        )
+    return " ".join(told)
 
 
 def decision_sentence(row: DecisionRow) -> str:

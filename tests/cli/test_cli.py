@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 import pytest
 
 import fieldcal
@@ -26,11 +27,23 @@ from fieldcal.simulation.experiment import Experiment
 REPOSITORY = Path(__file__).parents[2]
 
 
+def at_rest(path: Path) -> None:
+    """Twelve seconds on the bench, at their end turned by 45° about z and back."""
+    rng = np.random.default_rng(7)
+    t = np.arange(0.0, 12.0, 0.01)
+    readings = np.tile([0.0, 0.0, -9.81, 0.0, 0.0, 0.0], (len(t), 1)) + 0.01 * rng.normal(size=(len(t), 6))
+    readings[-100:, 5] += np.pi * np.deg2rad(45.0) * np.sin(2.0 * np.pi * t[:100])
+    path.parent.mkdir(parents=True)
+    names = ["t [s]", *(f"{kind}{axis} [{unit}]" for kind, unit in (("a", "m/s^2"), ("g", "rad/s")) for axis in "xyz")]
+    np.savetxt(path, np.column_stack([t, readings]), "%.9g", ",", header=",".join(names), comments="")
+
+
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("cli") / "archive"
     write_flights(folder, Experiment(seed=5, duration_s=25.0))
     (folder / "sim-1" / "2026-01-12" / "empty.mcap").write_bytes(b"")
+    at_rest(folder / "bench" / "2026-01-12" / "rest.csv")
     return folder
 
 
@@ -133,14 +146,34 @@ def test_a_rejected_log_is_told_and_ends_in_3(capsys: pytest.CaptureFixture[str]
 
 def test_the_night_as_json(capsys: pytest.CaptureFixture[str], archive: Path, warehouse: Path) -> None:
     found = document(capsys, "nightly", str(archive), "--warehouse", str(warehouse), "--json", code=3)
-    counts = {"ok", "partial", "quarantined", "rejected", "stages_run", "stages_cached", "seconds", "logs", "unread"}
-    assert set(found) - counts == {"stage_seconds", "server_seconds", "changes", "report"}
-    assert (found["ok"], found["rejected"], found["stages_run"]) == (1, 1, 0)
+    counts = {"ok", "partial", "no_result", "quarantined", "rejected"}
+    assert set(found) - counts - {"stages_run", "stages_cached", "seconds", "logs", "unread"} == {
+        "stage_seconds",
+        "server_seconds",
+        "changes",
+        "report",
+    }
+    assert (found["ok"], found["no_result"], found["rejected"], found["stages_run"]) == (1, 1, 1, 0)
     assert {"log_uri", "flight_id", "verdict", "reason_code", "reason"} <= set(found["logs"][0])
     planned = document(
         capsys, "session", str(archive / "sim-1/2026-01-12"), "--warehouse", str(warehouse), "--dry-run", "--json"
     )
     assert (planned["stages_to_run"], len(planned["logs"])) == (0, 2)
+
+
+def test_a_log_without_any_constant_is_told_with_the_motion_that_it_wanted(
+    capsys: pytest.CaptureFixture[str], archive: Path, warehouse: Path
+) -> None:
+    found = document(capsys, "calibrate", str(archive / "bench/2026-01-12/rest.csv"), "--json", code=3)
+    assert (found["flight"]["verdict"], found["flight"]["reason_code"]) == ("no_result", "too_little_motion")
+    said = (
+        "it turned by at most 0° about x, 0° about y, 45° about z: turn it by 90° or more, to and fro, about x, y, z."
+    )
+    assert said in found["flight"]["reason"]
+    query = "SELECT verdict, reason FROM flight WHERE vehicle_id = 'bench'"
+    assert document(capsys, "sql", query, "--json", "--warehouse", str(warehouse)) == [
+        {"verdict": "no_result", "reason": found["flight"]["reason"]}
+    ]
 
 
 def test_the_history_in_three_forms(capsys: pytest.CaptureFixture[str], warehouse: Path) -> None:
@@ -171,7 +204,7 @@ def test_a_name_that_the_history_does_not_have_is_told_with_the_nearest(
 
 def test_sql_reads_and_nothing_else(capsys: pytest.CaptureFixture[str], warehouse: Path) -> None:
     at = ("--warehouse", str(warehouse))
-    assert document(capsys, "sql", "SELECT count(*) AS n FROM flight", "--json", *at) == [{"n": 2}]
+    assert document(capsys, "sql", "SELECT count(*) AS n FROM flight", "--json", *at) == [{"n": 3}]
     assert "read" in sentence(capsys, "sql", "DROP TABLE flight", *at, code=2)
     assert "flihgt" in sentence(capsys, "sql", "SELECT * FROM flihgt", *at, code=2)
 

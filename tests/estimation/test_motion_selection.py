@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numerics_support import autoregressive
 
-from fieldcal.estimation.motion_selection import Segment, Selection, contiguous, select, windowed_rate
+from fieldcal.estimation.motion_selection import Segment, Selection, contiguous, select, turned_within, windowed_rate
 from fieldcal.simulation.experiment import Experiment, Motion
 
 RATE_HZ = 100.0
@@ -151,3 +151,19 @@ def test_a_hard_turn_shorter_than_what_is_needed_is_not_eked_out_with_rest(t: np
     assert lasts_s - WINDOW_S < found.excited_s < lasts_s + WINDOW_S
     first, last, _ = used_time(found, t)
     assert BEGINS_S - REST_S - WINDOW_S < first < last < BEGINS_S + lasts_s + REST_S + WINDOW_S
+
+
+@pytest.mark.parametrize("zero_radps", [0.0, 0.3])
+def test_how_far_a_vehicle_was_turned_is_the_range_of_the_angle(zero_radps: float) -> None:
+    """Sines of known amplitude in a log of which most is rest, across the border of two windows; a pause hides none."""
+    t = np.arange(0.0, 60.0, 0.01)
+    t[3000:] += 40.0
+    phase = np.clip(t - 13.0, 0.0, 4.0) * 2.0 * np.pi / 4.0
+    turns = (phase > 0.0) & (phase < 2.0 * np.pi)
+    rate = np.zeros((len(t), 3)) + zero_radps
+    amplitude = np.deg2rad([10.0, 45.0, 170.0])
+    rate[turns] += amplitude / 2.0 * np.sin(phase[turns])[:, None] * 2.0 * np.pi / 4.0
+    found = turned_within(t, rate)
+    np.testing.assert_allclose(found, amplitude, rtol=2e-3)
+    assert np.all(turned_within(t, np.zeros_like(rate)) == 0.0)
+    assert turned_within(t[:1], rate[:1]).shape == (3,)

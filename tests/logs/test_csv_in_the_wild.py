@@ -94,6 +94,18 @@ def test_units_of_temperatures_and_angles() -> None:
     assert prefixed_unit("gyroscope", "rad/s") is None
 
 
+def test_default_names_with_units_in_brackets_are_the_default_names(tmp_path: Path) -> None:
+    values = readings(20)
+    header = "t [ms],gx (deg/s),gy (deg/s),gz (deg/s),ax [m/s^2],ay [m/s^2],az [m/s^2]"
+    frames, summary = read(tmp_path, lines([str(10 * i) for i in range(20)], values, header))
+    assert (summary.units["gyroscope"], summary.units["accelerometer"]) == ("deg/s", "m/s^2")
+    assert frames["imu"]["t_ns"].diff()[1] == 10_000_000
+    np.testing.assert_array_equal(frames["imu"].select("gyroscope_x", "accelerometer_z"), values[:, [0, 5]])
+    twice = header.replace("gz (deg/s)", "gx [rad/s]")
+    with pytest.raises(UnreadableLog, match="gx"):
+        read(tmp_path, lines([str(10 * i) for i in range(20)], values, twice))
+
+
 def test_prefixes_and_kelvin_are_converted_and_told(tmp_path: Path) -> None:
     text = (
         "t_s,gx,gy,gz,ax,ay,az,temp\ns,mdps,mdps,mdps,mg,mg,mg,K\n0.1,1500,2,3,981,5,6,298.15\n0.2,1,2,3,4,5,6,273.15\n"

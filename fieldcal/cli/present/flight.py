@@ -25,6 +25,8 @@ def print_flight(console: Console, document: FlightDocument) -> None:
     """Print what `fieldcal.calibrate` found."""
     flight = document["flight"]
     console.print(verdict_sentence(flight), markup=False)
+    if flight["reason"]:
+        console.print(f"  {flight['reason']}", markup=False)
     for finding in flight["findings"] or []:
         if finding["sentence"] != flight["reason"]:
             console.print(f"  {finding['sentence']}", markup=False)

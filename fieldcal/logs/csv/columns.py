@@ -11,7 +11,7 @@ from fieldcal.config.values import Paths
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.csv.attitude import ANGLES, MATRIX, VECTOR, quaternion_by_names
 from fieldcal.logs.csv.dialect import Dialect
-from fieldcal.logs.csv.units import sensor_unit
+from fieldcal.logs.csv.units import sensor_unit, without_unit
 from fieldcal.logs.interface import LogSummary
 from fieldcal.logs.joining import INERTIAL
 from fieldcal.names import SENSORS
@@ -68,7 +68,8 @@ def find_columns(
 ) -> Columns:
     """Positions of the columns of one table ("imu", "vps").
 
-    A configured column must be there; the default names are taken where the file has them, all of a sensor or none.
+    A configured column must be there; the default names are taken where the file has them, with or without a unit in
+    brackets, all of a sensor or none.
 
     Raises
     ------
@@ -79,11 +80,13 @@ def find_columns(
     for key, default in defaults.items():
         wanted = configured.get(key)
         names = (wanted,) if isinstance(wanted, str) else tuple(wanted or default)
+        if not wanted:
+            names = tuple(_as_written(name, dialect) for name in names)
         if wanted or any(name in dialect.names for name in names):
             values[key] = tuple(_position(name, dialect, f"csv.{table}.{key}", log_name) for name in names)
     if configured.get("t"):
         return Columns(_position(str(configured["t"]), dialect, f"csv.{table}.t", log_name), values)
-    times = [name for name in TIME_DEFAULTS if name in dialect.names]
+    times = [own for name in TIME_DEFAULTS if (own := _as_written(name, dialect)) in dialect.names]
     return Columns(_position(times[0], dialect, f"csv.{table}.t", log_name) if times else None, values)
 
 
@@ -107,7 +110,7 @@ def known_by_names(dialect: Dialect, csv: CsvMap) -> set[str]:
     """Tables ("imu", "vps") that default or configured names tell: a sensor, or an attitude and its time."""
 
     def has_default(names: Sequence[str]) -> bool:
-        return any(name in dialect.names for name in names)
+        return any(_as_written(name, dialect) in dialect.names for name in names)
 
     known = {"imu"} if any(sensor in csv.imu or has_default(IMU_DEFAULTS[sensor]) for sensor in SENSORS) else set()
     attitude = has_default(VPS_DEFAULTS["quaternion_xyzw"]) or quaternion_by_names(dialect.names) is not None
@@ -178,6 +181,13 @@ def declared_units(dialect: Dialect, columns: Columns, summary: LogSummary, log_
         elif (unit := found.pop()) is not None:
             units[sensor] = unit
     return units
+
+
+def _as_written(name: str, dialect: Dialect) -> str:
+    """The column that a default name means: itself, else the one that is it with a unit in brackets. Of two of these
+    neither is meant."""
+    with_unit = [own for own in dialect.names if without_unit(own) == name]
+    return with_unit[0] if name not in dialect.names and len(with_unit) == 1 else name
 
 
 def _position(name: str, dialect: Dialect, key: str, log_name: str) -> int:

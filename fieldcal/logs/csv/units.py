@@ -105,6 +105,12 @@ def sensor_unit(sensor: str, column: str, row_cell: str | None) -> str | None:
     return _by_suffix(column, known | {name: name for name in PREFIXED_TOKENS[sensor]})
 
 
+def without_unit(column: str) -> str:
+    """A column's name without a unit in brackets behind it: `gx [rad/s]` is gx, `gyro[0]` stays."""
+    bracketed = _bracketed(column)
+    return column if bracketed is None or not _is_unit(token(bracketed)) else _BRACKETS.sub("", column).rstrip()
+
+
 def prefixed_unit(sensor: str, unit: str) -> tuple[str, float] | None:
     """Unit that readings in a unit with a prefix ("mg") are converted to, and the factor; None: it is none of these."""
     return PREFIXED_TOKENS[sensor].get(token(unit))
