@@ -27,10 +27,10 @@ def content_sha256(root: Path) -> str:
         folders: dict[Path, list[Path]] = {}
         for path in history_files(root, table):
             folders.setdefault(path.parent, []).append(path)
-        for folder in sorted(folders):
+        for folder in folders:
             rows = pl.concat([read_table(path, table) for path in folders[folder]])
             if rows.height:
-                digest.update(f"{table}\0{folder.name}\0{rows.height}\0".encode())
+                digest.update(f"{table}\0vehicle_id={folder.name.partition('=')[2]}\0{rows.height}\0".encode())
                 digest.update(rows_sha256(rows, table))
     return digest.hexdigest()
 

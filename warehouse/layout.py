@@ -21,7 +21,11 @@ _AS_IT_IS = re.compile(r"[A-Za-z0-9-][A-Za-z0-9._-]{0,149}")
 _EMPTY = "__HIVE_DEFAULT_PARTITION__"
 _LONGEST = 150
 _CUT = 100
-_PARTITION = "vehicle_id="
+SIGNAL_PARTITION = "vehicle_id="
+"""Of files that do not hold the id."""
+PARTITION, FORMER_PARTITION = "vehicle=", "vehicle_id="
+"""Of the history, whose files have the column vehicle_id: engines that take a folder's name for a column guess its
+type, and fail where the file has a column of that name and another type. `fieldcal upgrade` renames former folders."""
 
 
 def encode_id(text: str) -> str:
@@ -66,13 +70,17 @@ def decode_id(name: str) -> str | None:
 def signal_path(root: Path, table: str, vehicle_id: str, flight_id: str) -> Path:
     """File of one flight's readings."""
     _known(signal_kind(table), SIGNAL_TABLES)
-    return root / "signals" / table / f"{_PARTITION}{encode_id(vehicle_id)}" / f"{encode_id(flight_id)}.parquet"
+    return root / "signals" / table / f"{SIGNAL_PARTITION}{encode_id(vehicle_id)}" / f"{encode_id(flight_id)}.parquet"
 
 
 def history_path(root: Path, table: str, vehicle_id: str) -> Path:
-    """File of one vehicle's history."""
+    """File of one vehicle's history: where it lies, or will."""
     _known(table, HISTORY_TABLES)
-    return root / "tables" / table / f"{_PARTITION}{encode_id(vehicle_id)}" / "part.parquet"
+    name = encode_id(vehicle_id)
+    path, former = (
+        root / "tables" / table / f"{prefix}{name}" / "part.parquet" for prefix in (PARTITION, FORMER_PARTITION)
+    )
+    return former if former.exists() and not path.exists() else path
 
 
 def stage_folder(root: Path, stage: str, flight_id: str, run_key: str) -> Path:
@@ -83,18 +91,35 @@ def stage_folder(root: Path, stage: str, flight_id: str, run_key: str) -> Path:
 def history_files(root: Path, table: str) -> list[Path]:
     """Files of a history table, one a vehicle, in a fixed order."""
     _known(table, HISTORY_TABLES)
-    return sorted((root / "tables" / table).glob(f"{_PARTITION}*/*.parquet"))
+    found = {
+        (vehicle_name(path), path.name): path
+        for prefix in (FORMER_PARTITION, PARTITION)
+        for path in (root / "tables" / table).glob(f"{prefix}*/*.parquet")
+    }
+    return [found[place] for place in sorted(found)]
 
 
 def signal_files(root: Path, table: str) -> list[Path]:
     """Files of a signal table, one a flight, in a fixed order."""
     _known(signal_kind(table), SIGNAL_TABLES)
-    return sorted((root / "signals" / table).glob(f"{_PARTITION}*/*.parquet"))
+    return sorted((root / "signals" / table).glob(f"{SIGNAL_PARTITION}*/*.parquet"))
 
 
 def vehicle_of(path: Path) -> str | None:
     """Vehicle whose folder `path` lies in; None where the name is shortened."""
-    return decode_id(path.parent.name.removeprefix(_PARTITION))
+    return decode_id(vehicle_name(path))
+
+
+def twin(path: Path) -> Path:
+    """Where a file of the history lay or will lie: an upgrade that moves it records it in both places for a moment."""
+    key, _, name = path.parent.name.partition("=")
+    other = {PARTITION: FORMER_PARTITION, FORMER_PARTITION: PARTITION}.get(f"{key}=", f"{key}=")
+    return path.parent.with_name(f"{other}{name}") / path.name
+
+
+def vehicle_name(path: Path) -> str:
+    """The vehicle's id as it stands in the name of the folder that a file lies in."""
+    return path.parent.name.partition("=")[2]
 
 
 def checksum_path(root: Path, path: Path) -> Path:

@@ -12,9 +12,10 @@ import polars as pl
 from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES, signal_kind
 from fieldcal.schemas.migrations import fillings
 from fieldcal.warehouse.checksums import assure
-from fieldcal.warehouse.layout import encode_id, history_files, history_path, signal_files, signal_path
+from fieldcal.warehouse.layout import encode_id, history_files, history_path, signal_files, signal_path, vehicle_name
 from fieldcal.warehouse.signals import signal_ids
 from fieldcal.warehouse.store import by_absent_columns, empty_frame
+from fieldcal.warehouse.views import AT, VIEWS
 
 if TYPE_CHECKING:
     from fieldcal.warehouse.sql import Limits, SqlValue
@@ -35,7 +36,7 @@ class Warehouse:
         self.root = Path(root or os.environ.get("FIELDCAL_WAREHOUSE") or DEFAULT_ROOT)
 
     def scan(self, table: str, *, vehicle_id: str | None = None, flight_id: str | None = None) -> pl.LazyFrame:
-        """A table as a lazy frame; typed and empty when there is nothing yet.
+        """A table or a view as a lazy frame; a table typed and empty when there is nothing yet.
 
         Signals come with `vehicle_id` and `flight_id` in front; name a flight unless all of them are meant.
         `vehicle_id` and `flight_id` narrow what is read. Of further units on board: "imu.1", "magnetometer.1", ….
@@ -44,16 +45,17 @@ class Warehouse:
         Raises
         ------
         WarehouseError
-            `damaged_file`, `schema_mismatch`.
+            `damaged_file`, `schema_mismatch`; of a view as `sql`.
         ValueError
-            There is no such table.
+            There is no such table or view.
         """
+        if table in VIEWS and table not in AT:
+            return self._view(table, vehicle_id, flight_id)
         if signal_kind(table) in SIGNAL_TABLES:
             return self._signals(table, vehicle_id, flight_id)
         if table not in HISTORY_TABLES:
-            raise ValueError(
-                f"there is no table {table!r} to ask; there are {', '.join(HISTORY_TABLES + SIGNAL_TABLES)}"
-            )
+            there = ", ".join([*HISTORY_TABLES, *SIGNAL_TABLES, *(view for view in VIEWS if view not in AT)])
+            raise ValueError(f"there is no table {table!r} to ask; there are {there}")
         if vehicle_id is None:
             files = history_files(self.root, table)
         else:
@@ -74,13 +76,19 @@ class Warehouse:
 
         return run_sql(self.root, query, parameters, **limits)
 
+    def _view(self, view: str, vehicle_id: str | None, flight_id: str | None) -> pl.LazyFrame:
+        rows = self.sql(f"FROM {view}").lazy()
+        for name, value in (("vehicle_id", vehicle_id), ("flight_id", flight_id)):
+            rows = rows if value is None else rows.filter(pl.col(name) == value)
+        return rows
+
     def _signals(self, table: str, vehicle_id: str | None, flight_id: str | None) -> pl.LazyFrame:
         if vehicle_id is not None and flight_id is not None:
             files = [path for path in [signal_path(self.root, table, vehicle_id, flight_id)] if path.exists()]
         else:
             files = signal_files(self.root, table)
         if vehicle_id is not None:
-            files = [path for path in files if path.parent.name == f"vehicle_id={encode_id(vehicle_id)}"]
+            files = [path for path in files if vehicle_name(path) == encode_id(vehicle_id)]
         if flight_id is not None:
             files = [path for path in files if path.stem == encode_id(flight_id)]
         assure(self.root, files)

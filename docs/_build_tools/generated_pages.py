@@ -19,19 +19,28 @@ import fieldcal.warehouse.query
 from fieldcal.cli.main import app as command_line
 from fieldcal.config.parameters import PROFILES, Parameters
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.schemas.dictionary import data_dictionary
+from fieldcal.warehouse.reference import markdown, relations
 
+SECTIONS = {
+    "History: the tables to ask": ("history",),
+    "Views": ("view",),
+    "Signals: readings as logged": ("signal",),
+    "Stage tables: what passes between the stages of one flight": ("stage",),
+}
 FOLDER = "reference/generated"
 
 
 def tables() -> str:
-    """The data dictionary, from the schemas."""
-    title, _, rest = data_dictionary().partition("\n")
+    """The data dictionary: history and views with a question each, signals, stage tables."""
     about = (
-        "Written from `fieldcal.schemas`, as is `python -m fieldcal.schemas`. A star marks the columns that identify a "
+        "As `fieldcal schemas NAME` tells, `--json` and `--markdown` too. A star marks the columns that identify a "
         'row; a unit of "1" says dimensionless. A table\'s version grows with every change of its columns.'
     )
-    return f"{title}\n\n{about}\n{rest}"
+    parts = [f"# Data dictionary\n\n{about}\n"]
+    known = relations().values()
+    for title, kinds in SECTIONS.items():
+        parts.append(f"## {title}\n\n{markdown(one for one in known if one.kind in kinds)}")
+    return "\n".join(parts)
 
 
 def commands() -> str:

@@ -18,10 +18,10 @@ from fieldcal.cli.fly import apply, compare, export
 from fieldcal.cli.interrupt import interruptible
 from fieldcal.cli.look import init, inspect
 from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
-from fieldcal.cli.prune import prune
 from fieldcal.cli.report import report as report_command
 from fieldcal.cli.serve import serve, trigger
 from fieldcal.cli.simulate import simulate
+from fieldcal.cli.upkeep import export_warehouse, prune, schemas
 from fieldcal.names import Verdict
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.words.printable import printable
@@ -419,6 +419,8 @@ app.command(report_command, name="report")
 app.command(serve)
 app.command(trigger)
 app.command(prune)
+app.command(schemas)
+app.command(export_warehouse)
 app.command(simulate)
 app.command(drift)
 app.command(export)

@@ -31,7 +31,7 @@ from fieldcal.schemas.migrations import CHANGES, Change, fillings
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse import Warehouse, WarehouseError
-from fieldcal.warehouse.layout import history_files, history_path
+from fieldcal.warehouse.layout import history_files, history_path, vehicle_of
 from fieldcal.warehouse.publish import publish, read_history
 from fieldcal.warehouse.store import empty_frame
 from fieldcal.warehouse.upkeep.upgrade import upgrade
@@ -56,7 +56,7 @@ def files(root: Path) -> dict[str, bytes]:
 
 def versions(root: Path) -> dict[str, int]:
     return {
-        str(path.relative_to(root)): int(pq.read_schema(path).metadata[VERSION_KEY.encode()])
+        f"{table}/{vehicle_of(path)}": int(pq.read_schema(path).metadata[VERSION_KEY.encode()])
         for table in HISTORY_TABLES
         for path in history_files(root, table)
     }
@@ -79,7 +79,8 @@ def test_every_row_and_value_of_an_older_warehouse_stays(commit: str, tmp_path: 
     assert [{**file, "status": "due"} for file in done["upgraded"]] == planned["upgraded"]
     assert sum(file["rows"] for file in done["upgraded"]) >= 40
     after = files(root)
-    assert set(versions(root)) == {f"tables/{table}/vehicle_id=sim-1/part.parquet" for table in written}
+    assert set(after) == {f"tables/{table}/vehicle=sim-1/part.parquet" for table in written}
+    assert not list(root.rglob("vehicle_id=*"))
     for table, before in written.items():
         assert isinstance(before, pl.DataFrame)
         now = read_history(root, table, "sim-1")
@@ -130,9 +131,28 @@ def test_a_night_on_top_keeps_what_was_there(upgraded: bool, tmp_path: Path) -> 
         pl.col("flight_id").is_in(before["flight_id"].unique().to_list())
     )
     polars.testing.assert_frame_equal(after, before, check_row_order=False)
-    assert {path.split("/")[1]: version for path, version in versions(root).items()}.items() <= {
+    assert {path.split("/")[0]: version for path, version in versions(root).items()}.items() <= {
         (table, TABLES[table].version) for table in HISTORY_TABLES
     }
+
+
+@pytest.mark.parametrize("vehicle_id", ["a", "7", "x" * 500])
+def test_folders_of_before_are_read_written_and_renamed(vehicle_id: str, tmp_path: Path) -> None:
+    """Whose names engines took for another column of the same name."""
+    publish(tmp_path, vehicle_id, flight(vehicle_id, "f1"), ["f1"])
+    content = verify(tmp_path)["content_sha256"]
+    for folder in [*tmp_path.rglob("vehicle=*")]:
+        folder.rename(folder.with_name(folder.name.replace("vehicle=", "vehicle_id=")))
+    assert verify(tmp_path)["content_sha256"] == content
+    publish(tmp_path, vehicle_id, flight(vehicle_id, "f2"), ["f2"])
+    assert set(Warehouse(tmp_path).scan("flight", vehicle_id=vehicle_id).collect()["flight_id"]) == {"f1", "f2"}
+    assert not list((tmp_path / "tables" / "flight").glob("vehicle=*"))
+    found = verify(tmp_path)
+    assert found["ok"]
+    assert upgrade(tmp_path)["ok"]
+    assert verify(tmp_path) == found
+    assert not list(tmp_path.rglob("vehicle_id=*"))
+    assert upgrade(tmp_path)["upgraded"] == []
 
 
 KILLED_AT_EVERY_RENAME = """
@@ -166,7 +186,7 @@ def test_killed_at_any_rename_it_is_finished_by_the_next(tmp_path: Path) -> None
     former, content, renames = (
         versions(root),
         verify(root)["content_sha256"],
-        3 * len(history_files(root, "flight")) * 5,
+        4 * len(history_files(root, "flight")) * 5,
     )
     program = [sys.executable, "-c", KILLED_AT_EVERY_RENAME, str(root), str(tmp_path / "killed"), str(renames + 1)]
     subprocess.run(program, check=True, timeout=120)
@@ -182,7 +202,7 @@ def test_killed_at_any_rename_it_is_finished_by_the_next(tmp_path: Path) -> None
         assert upgrade(killed)["ok"]
         assert files(killed) == files(root)
         assert verify(killed)["ok"]
-    assert states == [(number + 1) // 3 for number in range(renames)] + [5]
+    assert states == [(number + 2) // 4 for number in range(renames)] + [5]
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from fieldcal.warehouse import views as view_text
-from fieldcal.warehouse.sql import VIEWS
+from fieldcal.warehouse.views import VIEWS
 
 
 @pytest.mark.parametrize("view", VIEWS)

@@ -83,7 +83,7 @@ def test_400_flips_of_single_bits_are_found_400_times(root: Path) -> None:
 
 def test_missing_and_foreign_files_are_named(root: Path) -> None:
     signal_path(root, "position", "v", "a").unlink()
-    (root / "tables" / "flight" / "vehicle_id=v" / "copy.parquet").write_bytes(b"x")
+    (root / "tables" / "flight" / "vehicle=v" / "copy.parquet").write_bytes(b"x")
     reasons = {Path(item["path"]).name: item["reason"] for item in verify(root)["damaged"]}
     assert reasons == {"a.parquet": "it is missing", "copy.parquet": "no sha256 is recorded for it"}
 
@@ -104,7 +104,7 @@ def test_a_lost_record_is_named(root: Path) -> None:
 
 
 def test_leftovers_of_killed_writers_are_no_damage(root: Path) -> None:
-    (root / "tables" / "flight" / "vehicle_id=v" / ".0123.tmp").write_bytes(b"half")
+    (root / "tables" / "flight" / "vehicle=v" / ".0123.tmp").write_bytes(b"half")
     assert verify(root)["ok"]
 
 

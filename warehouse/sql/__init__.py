@@ -30,10 +30,7 @@ from fieldcal.warehouse.checksums import assure
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.layout import history_files, vehicle_of
 from fieldcal.warehouse.store import by_absent_columns, frame
-from fieldcal.warehouse.views import view_text
-
-# In the order in which they are made: later ones may need earlier ones.
-VIEWS = ("latest_calibration", "history", "drift_by_temperature", "worst_tic", "refusals", "active", "calibration_at")
+from fieldcal.warehouse.views import VIEWS, view_text
 
 _ABOUT_ALL = ("show", "describe", "summarize", "information_schema", "duckdb_", "pg_", "pragma_")
 _ENGINE = Path(__file__).with_name("engine.py")
@@ -113,7 +110,7 @@ def _made(root: Path, query: str, views: Mapping[str, str]) -> dict[str, object]
     needed = "".join([query.lower(), *views.values()]) if len(views) < len(VIEWS) else "".join(HISTORY_TABLES)
     paths = {table: history_files(root, table) for table in HISTORY_TABLES if table in needed}
     assure(root, [path for own in paths.values() for path in own])
-    tables = [_table_view(table, own) if own else _empty_table(table) for table, own in paths.items()]
+    tables = [_table_view(table, own) if own else empty_table(table) for table, own in paths.items()]
     return {"made": [*tables, *views.values()], "paths": _listed([path for own in paths.values() for path in own])}
 
 
@@ -123,7 +120,8 @@ def _table_view(table: str, paths: Sequence[Path]) -> str:
     return f"CREATE VIEW {table} AS {' UNION ALL '.join(_select(table, own, absent) for absent, own in forms.items())}"
 
 
-def _empty_table(table: str) -> str:
+def empty_table(table: str) -> str:
+    """The statement that makes a table of the history without rows."""
     columns = ", ".join(f'"{field.name}" {_sql_type(field)}' for field in schemas.arrow_schema(table))
     return f"CREATE TABLE {table} ({columns})"
 
@@ -141,12 +139,14 @@ def _select(table: str, paths: Sequence[Path], absent: Collection[str]) -> str:
 
     Columns are qualified: inside a macro a bare name would be the macro's parameter.
     """
-    by_folder = all(vehicle_of(path) for path in paths)
-    how = (
-        "hive_partitioning = true, hive_types = {'vehicle_id': 'VARCHAR'}" if by_folder else "hive_partitioning = false"
-    )
-    names = schemas.TABLES[table].column_names
-    columns = ", ".join(_younger(table, name) if name in absent else f'f."{name}"' for name in names)
+    keys = {path.parent.name.partition("=")[0] for path in paths}
+    by_folder = len(keys) == 1 and all(vehicle_of(path) for path in paths)
+    how, own = "hive_partitioning = false", dict.fromkeys(schemas.TABLES[table].column_names, "")
+    if by_folder:
+        (key,) = keys
+        how = f"hive_partitioning = true, hive_types = {{'{key}': 'VARCHAR'}}"
+        own["vehicle_id"] = f'f."{key}" AS "vehicle_id"'
+    columns = ", ".join(_younger(table, n) if n in absent else known or f'f."{n}"' for n, known in own.items())
     return f"SELECT {columns} FROM read_parquet({_listed(paths)}, {how}) AS f"
 
 

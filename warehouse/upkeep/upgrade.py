@@ -6,6 +6,8 @@ Signals have had one version since the first night; stages, reports and what a n
 from __future__ import annotations
 
 import hashlib
+import os
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Literal, TypedDict
@@ -16,8 +18,15 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import HISTORY_TABLES, TABLES
 from fieldcal.warehouse import checksums
 from fieldcal.warehouse.errors import WarehouseError, disk
-from fieldcal.warehouse.files import remove_abandoned, write_bytes
-from fieldcal.warehouse.layout import history_files, vehicle_of
+from fieldcal.warehouse.files import remove_abandoned, sync_folder, write_bytes
+from fieldcal.warehouse.layout import (
+    FORMER_PARTITION,
+    PARTITION,
+    checksum_path,
+    history_files,
+    vehicle_name,
+    vehicle_of,
+)
 from fieldcal.warehouse.lock import vehicle_lock
 from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.store import read_older, table_bytes
@@ -45,7 +54,8 @@ class Upgrade(TypedDict):
 
 
 def upgrade(root: Path, *, dry_run: bool = False, timeout_s: float = 300.0) -> Upgrade:
-    """Rewrite every file of the history that an older version wrote as today's version, rows and values unchanged.
+    """Rewrite every file of the history that an older version wrote as today's version, in today's place, with all its
+    rows and values.
 
     Each file is replaced under its vehicle's lock, its sha256 recorded; killed at any moment, this leaves every file
     whole in one version or the other, and the next run does the rest. What cannot be read is left alone.
@@ -60,8 +70,8 @@ def upgrade(root: Path, *, dry_run: bool = False, timeout_s: float = 300.0) -> U
     Returns
     -------
     dict
-        `ok` (nothing was left), `files` (how many were looked at), `upgraded`: those that are not of today's version or
-        cannot be read, with status "upgraded", "due" or "left" and the reason; paths relative to `root`.
+        `ok` (nothing was left), `files` (how many were looked at), `upgraded`: those of another version or place,
+        or that cannot be read, with status "upgraded", "due" or "left" and the reason; paths relative to `root`.
 
     Raises
     ------
@@ -73,8 +83,32 @@ def upgrade(root: Path, *, dry_run: bool = False, timeout_s: float = 300.0) -> U
         remove_abandoned(root)
     files = [(table, path) for table in HISTORY_TABLES for path in history_files(root, table)]
     found = [_upgraded(root, table, path, dry_run, timeout_s) for table, path in files]
+    if not dry_run:
+        _remove_former_records(root)
     told = [outcome for outcome in found if outcome is not None]
     return {"ok": all(outcome["status"] != "left" for outcome in told), "files": len(files), "upgraded": told}
+
+
+def _todays(path: Path) -> Path:
+    """Where a file of the history lies by today's names."""
+    return path.parent.with_name(PARTITION + vehicle_name(path)) / path.name
+
+
+def _rename(root: Path, former: Path, path: Path) -> None:
+    """Give a file's folder today's name. What was recorded of the file is there under both names for a moment."""
+    records = checksum_path(root, former).parent
+    with disk(former, "renamed"):
+        if records.is_dir():
+            shutil.copytree(records, checksum_path(root, path).parent, dirs_exist_ok=True)
+        os.replace(former.parent, path.parent)
+        sync_folder(path.parent.parent)
+
+
+def _remove_former_records(root: Path) -> None:
+    """Records of files that have moved: also of those after whose move an upgrade was killed."""
+    for records in (root / "checksums" / "tables").glob(f"*/{FORMER_PARTITION}*"):
+        if not (root / records.relative_to(root / "checksums")).exists():
+            shutil.rmtree(records, ignore_errors=True)
 
 
 def _upgraded(root: Path, table: str, path: Path, dry_run: bool, timeout_s: float) -> FileUpgrade | None:
@@ -83,7 +117,7 @@ def _upgraded(root: Path, table: str, path: Path, dry_run: bool, timeout_s: floa
     outcome: FileUpgrade = {
         "table": table,
         "vehicle_id": vehicle_of(path) or path.parent.name,
-        "path": str(path.relative_to(root)),
+        "path": str(_todays(path).relative_to(root)),
         "status": "due" if dry_run else "upgraded",
         "from_version": None,
         "to_version": known,
@@ -92,7 +126,8 @@ def _upgraded(root: Path, table: str, path: Path, dry_run: bool, timeout_s: floa
     }
     try:
         version, rows = _read(root, table, path)
-        if version == known:
+        moves = path != _todays(path)
+        if version == known and not moves:
             return None
         ids = rows["vehicle_id"].unique().to_pylist()
         outcome["vehicle_id"] = vehicle_id = ids[0] if ids else outcome["vehicle_id"]
@@ -102,6 +137,8 @@ def _upgraded(root: Path, table: str, path: Path, dry_run: bool, timeout_s: floa
                 version, rows = _read(root, table, path)  # a night may have published meanwhile
                 if version != known:
                     write_bytes(path, table_bytes(rows, table), partial(checksums.recording, root, path))
+                if moves:
+                    _rename(root, path, _todays(path))
     except WarehouseError as error:
         if error.reason_code not in (ReasonCode.DAMAGED_FILE, ReasonCode.SCHEMA_MISMATCH):
             raise

@@ -13,7 +13,7 @@ from fieldcal.warehouse import checksums
 from fieldcal.warehouse.content import content_sha256
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import TEMPORARY, file_sha256
-from fieldcal.warehouse.layout import history_files
+from fieldcal.warehouse.layout import history_files, twin
 from fieldcal.warehouse.sealed import BrokenSeal, unseal
 from fieldcal.warehouse.stage_store import RECORD, broken_outputs, outputs_of
 from fieldcal.warehouse.store import read_table
@@ -87,6 +87,8 @@ def _recorded_files(root: Path) -> Iterator[Problem]:
         root / path.relative_to(records).with_name(path.name.removesuffix(".json")) for path in records.rglob("*.json")
     }
     for path in sorted(paths):
+        if not path.exists() and path.is_relative_to(root / "tables") and twin(path).exists():
+            continue
         try:
             sha256 = file_sha256(path) if path.exists() else None
             yield str(path.relative_to(root)), checksums.problem(root, path, sha256)

@@ -7,6 +7,10 @@ from importlib.resources import files
 from fieldcal.names import PREFERRED_METHODS
 from fieldcal.schemas.reference import ENOUGH_SESSIONS, REFERENCE_DEGC, SAME_VALUE, UNCONFIRMED_SD
 
+VIEWS = ("latest_calibration", "history", "drift_by_temperature", "worst_tic", "refusals", "active", "calibration_at")
+"""In the order in which they are made: later ones may need earlier ones."""
+AT = {"calibration_at": "calibration_at(12.5)"}
+"""Views of a value, as one calls them."""
 VALUES = {
     "reference_degc": f"{REFERENCE_DEGC:g}",
     "enough_sessions": str(ENOUGH_SESSIONS),
