@@ -402,6 +402,8 @@ class ReasonCode(StrEnum):
     """A worker died with its flights."""
     NO_DASK = "no_dask"
     """Dask is not installed."""
+    NO_APPRISE = "no_apprise"
+    """apprise, which sends alerts, is not installed."""
     NO_DEPLOYMENT = "no_deployment"
     """The server has no such deployment."""
     NO_SCHEDULER = "no_scheduler"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import cast
 
@@ -13,6 +14,7 @@ from fieldcal.batch.documents import Answer, Batch, NightDocument, PlainOutcome
 from fieldcal.batch.flights import lost
 from fieldcal.batch.night import Night, Watcher, plan_night, publishings
 from fieldcal.batch.outcome import Outcome
+from fieldcal.batch.telling import telling
 from fieldcal.config.find import Source
 from fieldcal.flight.job import PlainJob
 from fieldcal.flows.alive import alive
@@ -25,6 +27,7 @@ from fieldcal.flows.tasks import publish_as_task, run_batch
 from fieldcal.provenance.run_key import code_digest
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse.errors import WarehouseError
+from fieldcal.words.printable import printable
 from fieldcal.words.talk import say
 
 PlainValue = str | list[int] | None
@@ -99,7 +102,10 @@ def flow_of(
     `keep` gets the result too: the flow itself fails if Prefect cannot tell its server that it has ended.
     """
 
-    @flow(name="nightly" if night.session is None else "session", persist_result=False, validate_parameters=False)
+    name = "nightly" if night.session is None else "session"
+    about = printable(f"{(night.session or night.archive).resolve().name}, {datetime.now():%Y-%m-%d %H:%M}")
+
+    @flow(name=name, flow_run_name=lambda: about, persist_result=False, validate_parameters=False)
     def planned(folder: str, warehouse: str, workers: int, runner: str) -> NightDocument:
         result = carry_out(night, parallel, watcher, processes)
         keep(result)
@@ -114,9 +120,10 @@ def carry_out(
     watcher: Watcher | None = None,
     processes: Processes | None = None,
 ) -> NightDocument:
-    """Run what the plan says, within a flow run; the JSON of the night."""
+    """Run what the plan says, within a flow run; the JSON of the night. People are told what is new in it, or that it
+    failed."""
     tell_while_heard()
-    with alive(night.root):
+    with alive(night.root), telling(night) as tell:
         if watcher is not None:
             watcher.planned(len(night.plan.jobs), len(night.plan.missing), len(night.plan.done))
         outcomes = []
@@ -132,6 +139,7 @@ def carry_out(
         result = night.document(outcomes, closing)
         keep_artifact(result, night.root)
         tell_prefect(closing.changes)
+        tell(result)
         return result
 
 

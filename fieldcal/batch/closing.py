@@ -67,7 +67,7 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
             update_drift(root)
         table = Warehouse(root).scan("drift").collect()
         # With other limits than last time, what they make old is told whenever it passed them.
-        limits = alerts.model_dump()
+        limits: dict[str, Json] = {"expires_days": alerts.expires_days, "idle_days": alerts.idle_days}
         at = before.get("at")
         since = datetime.fromisoformat(at) if isinstance(at, str) and before.get("alerts") == limits else None
         told = changes(former, table, last_usable(root), now=now, since=since, alerts=alerts)

@@ -19,7 +19,7 @@ from fieldcal.cli.interrupt import interruptible
 from fieldcal.cli.look import init, inspect
 from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
 from fieldcal.cli.report import report as report_command
-from fieldcal.cli.serve import serve, trigger
+from fieldcal.cli.serve import alerts_app, serve, trigger
 from fieldcal.cli.simulate import simulate
 from fieldcal.cli.upkeep import export_warehouse, prune, schemas
 from fieldcal.names import Verdict
@@ -418,6 +418,7 @@ app.command(config_app)
 app.command(report_command, name="report")
 app.command(serve)
 app.command(trigger)
+app.command(alerts_app)
 app.command(prune)
 app.command(schemas)
 app.command(export_warehouse)

@@ -1,13 +1,16 @@
-"""`fieldcal serve` and `fieldcal trigger`: the schedule, and the ground station's call."""
+"""Nights that nobody starts: `serve`, the schedule; `trigger`, the ground station's call; `alerts`, who hears."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
-from fieldcal.cli.options import AsJson, Config, Root, SessionFolder, Whole
+from cyclopts import App
+
+from fieldcal.cli.options import AsJson, Config, Root, SessionFolder, UnusedRoot, Whole
 from fieldcal.reason_codes import ReasonCode
 
+alerts_app = App(name="alerts", help="Whom nights tell what is new ([alerts] to in fieldcal.toml).")
 EVERY_NIGHT = "0 3 * * *"
 
 
@@ -113,6 +116,40 @@ def trigger(
         known = "is scheduled" if asked["created"] else f"was asked for before; it is {asked['state'].lower()}"
         print(f"{folder}: flow run {asked['name']} {known}")
     return 0
+
+
+@alerts_app.command(name="test")
+def send_test(
+    archive: Path = Path(), /, *, as_json: AsJson = False, config: Config = None, warehouse: UnusedRoot = None
+) -> int:
+    """Send a message to everybody whom a night tells, and say who took it.
+
+    Parameters
+    ----------
+    archive
+        Whose fieldcal.toml counts, unless --config names one.
+    """
+    from dataclasses import asdict
+
+    from fieldcal.batch.telling.message import Message
+    from fieldcal.batch.telling.send import send
+    from fieldcal.cli.show import print_json
+    from fieldcal.config.find import configuration_of, find_source
+    from fieldcal.errors import FieldcalError
+    from fieldcal.words.printable import printable
+
+    to = configuration_of(find_source(config, archive)).alerts.to
+    if not to:
+        told = 'Nobody is to be told: [alerts] of fieldcal.toml has no `to`, a list of URLs as "ntfy://topic".'
+        raise FieldcalError(ReasonCode.WRONG_OPTION, told)
+    title = printable(f"fieldcal, {archive.resolve().name}: a test")
+    sent = send(Message(title, "A night that has news will tell them here.\n"), to, os.environ)
+    if as_json:
+        print_json([asdict(one) for one in sent])
+    else:
+        for one in sent:
+            print(printable(f"{one.place}: {one.problem or 'took the message'}"))
+    return 1 if any(one.problem for one in sent) else 0
 
 
 def _lost(home: Path) -> str:

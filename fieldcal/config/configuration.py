@@ -245,10 +245,18 @@ class Archive(Table):
 
 
 class Alerts(Table):
-    """Days after which a sensor's latest calibration has expired, and a vehicle without a usable flight is idle."""
+    """When to warn: days after which a sensor's latest calibration has expired, and a vehicle without a usable flight
+    is idle. And whom to tell."""
 
     expires_days: Annotated[Positive, _meaning("age at which a calibration has expired", "d")] = 90.0
     idle_days: Annotated[Positive, _meaning("time without a usable flight after which a vehicle is idle", "d")] = 30.0
+    to: Annotated[
+        list[Text], _meaning("whom the night tells what is new: apprise's URLs, $NAME from the environment")
+    ] = []
+    link: Annotated[Text | None, _meaning("URL of the folder of reports, for links in messages")] = None
+    metrics: Annotated[Text | None, _meaning("file that a night writes its metrics to, OpenMetrics text (.prom)")] = (
+        None
+    )
 
 
 class Limits(Table):
