@@ -403,7 +403,7 @@ class ReasonCode(StrEnum):
     NO_DASK = "no_dask"
     """Dask is not installed."""
     NO_APPRISE = "no_apprise"
-    """apprise, which sends alerts, is not installed."""
+    """Apprise, which sends alerts, is not installed."""
     NO_DEPLOYMENT = "no_deployment"
     """The server has no such deployment."""
     NO_SCHEDULER = "no_scheduler"

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import cast
 
 from prefect import Flow, flow
+from prefect.states import Failed
 
 from fieldcal.batch.closing import close_night
 from fieldcal.batch.documents import Answer, Batch, NightDocument, PlainOutcome
@@ -24,6 +25,7 @@ from fieldcal.flows.pool import hand_over, pool_answers
 from fieldcal.flows.processes import Processes, process_answers
 from fieldcal.flows.runners import Answers, Parallel, batches, dask_answers
 from fieldcal.flows.tasks import publish_as_task, run_batch
+from fieldcal.names import Status
 from fieldcal.provenance.run_key import code_digest
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse.errors import WarehouseError
@@ -109,7 +111,7 @@ def flow_of(
     def planned(folder: str, warehouse: str, workers: int, runner: str) -> NightDocument:
         result = carry_out(night, parallel, watcher, processes)
         keep(result)
-        return result
+        return told_apart(result)
 
     return planned
 
@@ -141,6 +143,17 @@ def carry_out(
         tell_prefect(closing.changes)
         tell(result)
         return result
+
+
+def told_apart(result: NightDocument) -> NightDocument:
+    """What a flow returns of its night: where stages failed a state that Prefect shows red, with what failed."""
+    failed = [log for log in result["logs"] if any(own["status"] == Status.FAILED for own in log["refusals"])]
+    if not failed:
+        return result
+    reasons = [f"{log['log_uri']}: {log['reason']}" for log in failed]
+    more = f" … and {len(failed) - 1} more" if len(failed) > 1 else ""
+    told = f"Stages of {len(failed)} of {len(result['logs'])} logs failed; the rest is published. {reasons[0]}{more}"
+    return cast(NightDocument, Failed(message=printable(told)))
 
 
 def _calibrate(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from fieldcal.batch.documents import NightDocument, PlanDocument, PlannedLog, UnreadEntry
 from fieldcal.config.find import configuration_of, find_source
@@ -14,6 +14,8 @@ from fieldcal.warehouse.layout import prepare
 from fieldcal.words.talk import say
 
 if TYPE_CHECKING:
+    from prefect import State
+
     from fieldcal.batch.night import Watcher
 
 
@@ -56,7 +58,12 @@ def run_night(
                 kept: list[NightDocument] = []
                 planned = flow_of(night, parallel, progress, processes, kept.append)
                 try:
-                    result = planned(str(session or archive), str(root), workers, runner)
+                    state: State[NightDocument] = cast(Any, planned)(
+                        str(session or archive), str(root), workers, runner, return_state=True
+                    )
+                    if not kept:
+                        state.result()  # raises what ended it
+                    result = kept[0]
                 except Exception as error:
                     if not kept:
                         raise

@@ -19,7 +19,7 @@ from fieldcal.batch.night import plan_night
 from fieldcal.batch.session_folder import archive_of
 from fieldcal.errors import FieldcalError
 from fieldcal.flows.farewell import end_with_parent
-from fieldcal.flows.nightly import carry_out
+from fieldcal.flows.nightly import carry_out, told_apart
 from fieldcal.flows.runners import Parallel
 from fieldcal.flows.trigger import trigger
 from fieldcal.reason_codes import ReasonCode
@@ -82,7 +82,7 @@ def served_nightly(served: Served) -> Flow[..., NightDocument]:
         end_with_parent()
         served.need({"archives": archives, "warehouse": warehouse, "config": config, "workers": workers})
         night = plan_night(served.archives[0], served.warehouse, served.config)
-        return carry_out(night, Parallel(served.workers))
+        return told_apart(carry_out(night, Parallel(served.workers)))
 
     return nightly
 
@@ -96,7 +96,8 @@ def served_session(served: Served) -> Flow[..., NightDocument]:
         end_with_parent()
         served.need({"archives": archives, "warehouse": warehouse, "config": config, "workers": workers})
         archive, place = archive_of(Path(folder), served.archives)
-        return carry_out(plan_night(archive, served.warehouse, served.config, place), Parallel(served.workers))
+        night = plan_night(archive, served.warehouse, served.config, place)
+        return told_apart(carry_out(night, Parallel(served.workers)))
 
     return session
 

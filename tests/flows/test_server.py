@@ -242,3 +242,24 @@ def test_a_planted_pickle_does_not_run(archive: Path, tmp_path: Path, prefect_se
     assert result["stages_cached"] == 0
     assert result["ok"] == 1
     assert not told.exists()
+
+
+@pytest.mark.parametrize("failed", [False, True])
+def test_a_night_of_which_stages_failed_is_red_in_prefect_and_told_all_the_same(
+    failed: bool, archive: Path, prefect_server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from prefect.client.orchestration import get_client
+
+    from fieldcal.flows import nightly
+
+    refusals = [{"stage": "joint", "status": "failed", "reason_code": "stage_failed", "reason": "ZeroDivisionError"}]
+    log = {"log_uri": "sim-1/s/f.mcap", "reason": "ZeroDivisionError", "refusals": refusals if failed else []}
+    monkeypatch.setattr(nightly, "carry_out", lambda *given: {"logs": [log]})
+    began = time.time()
+    assert run_night(archive, tmp_path)["logs"] == [log]
+    with connected(prefect_server), get_client(sync_client=True) as client:
+        runs = [run for run in client.read_flow_runs() if run.start_time and run.start_time.timestamp() > began - 1.0]
+    (state,) = [run.state for run in runs if run.name.startswith("archive, ")]
+    assert state is not None
+    assert state.is_failed() == failed
+    assert ("sim-1/s/f.mcap: ZeroDivisionError" in str(state.message)) == failed
