@@ -27,6 +27,8 @@ class ReasonCode(StrEnum):
     """No text where text was expected."""
     NOT_BAG = "not_bag"
     """Not a ROS bag, or none whose topics can be found."""
+    BAD_DUMP = "bad_dump"
+    """No whole dump of sums collected on board."""
     NOT_MCAP = "not_mcap"
     """No MCAP file, though its name says so."""
     NOT_AN_AUTOPILOT_LOG = "not_an_autopilot_log"
