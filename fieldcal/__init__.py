@@ -87,6 +87,7 @@ __all__ = [
     "simulate",
     "synchronise",
     "write_flights",
+    "write_onboard",
 ]
 
 _NAMES_OF = {
@@ -112,6 +113,7 @@ _NAMES_OF = {
         "JointEstimate",
         "fit_joint",
     ),
+    "api.onboard": ("write_onboard",),
     "api.output_error": (
         "OutputErrorFit",
         "fit_output_error",
@@ -158,6 +160,7 @@ if TYPE_CHECKING:
     from fieldcal.api.ellipsoid import EllipsoidFit, fit_ellipsoid
     from fieldcal.api.estimate import Estimate
     from fieldcal.api.joint import JointEstimate, fit_joint
+    from fieldcal.api.onboard import write_onboard
     from fieldcal.api.output_error import OutputErrorFit, fit_output_error
     from fieldcal.api.plot import plot
     from fieldcal.api.recording import Recording, read_log

@@ -64,7 +64,7 @@ def test_errors_are_as_large_as_claimed_and_have_no_mean(full: bool, tilt_deg: f
 
 
 def test_without_the_correction_the_scale_would_be_wrong() -> None:
-    """The same quadric from moments that noise is left in is more than one per cent off within ±45°; adjusted it is not."""
+    """The quadric of moments that noise is left in is more than one per cent off within ±45°; adjusted it is not."""
     rng = np.random.default_rng(5)
     moments = Moments()
     moments.feed(readings(tilting(rng, 20000, 45.0), SCALE + CROSS, BIAS, NOISE, rng))
