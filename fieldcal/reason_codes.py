@@ -347,6 +347,8 @@ class ReasonCode(StrEnum):
     """There is no such folder of logs."""
     NO_SESSION = "no_session"
     """There is no such folder of a session."""
+    NOT_ONE_FIT = "not_one_fit"
+    """Flights of other fields, units or polarities, which no constants fit together."""
     NO_CALIBRATION = "no_calibration"
     """Nothing calibrated to fly with."""
     NOT_LOADABLE = "not_loadable"

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from fieldcal.config.find import configuration_of, find_source
-from fieldcal.config.flight_settings import FlightSettings, flight_settings
+from fieldcal.config.flight_settings import flight_settings
 from fieldcal.names import Sensor, Triple
 from fieldcal.onboard.board import BoardSettings
 from fieldcal.onboard.handout import write_sources
 
+UNNAMED = "board"
+"""A vehicle that the configuration does not name."""
 GRAVITY_SIGNS = {"gravity": 1.0, "specific_force": -1.0}
 
 
@@ -66,9 +69,8 @@ def write_onboard(
     """
     if not (imu_rate_hz > 0 and magnetometer_rate_hz > 0 and 0 < forgetting <= 1):
         raise ValueError("rates are positive and forgetting is in (0, 1]")
-    configuration = configuration_of(find_source(None if config is None else Path(config), None))
-    settings = board_settings(
-        flight_settings(configuration.vehicle(vehicle or ""), units={}),
+    settings = replace(
+        settings_of_board(vehicle, config),
         imu_rate_hz=imu_rate_hz,
         magnetometer_rate_hz=magnetometer_rate_hz,
         full=full,
@@ -77,24 +79,21 @@ def write_onboard(
     return write_sources(folder, settings, told=vehicle or "")
 
 
-def board_settings(
-    s: FlightSettings, *, imu_rate_hz: float, magnetometer_rate_hz: float, full: bool = False, forgetting: float = 1.0
-) -> BoardSettings:
-    """What a board must know of a vehicle whose settings are these."""
+def settings_of_board(vehicle: str | None, config: Path | str | None) -> BoardSettings:
+    """What a board must know of a vehicle, as its configuration has it."""
+    configuration = configuration_of(find_source(None if config is None else Path(config), None))
+    s = flight_settings(configuration.vehicle(vehicle or UNNAMED), units={})
     north, east, down = np.asarray(s.field_ned, dtype=float) / np.linalg.norm(s.field_ned)
     parameters = s.parameters
     return BoardSettings(
         field_norm=float(np.linalg.norm(s.field_ned)),
+        field_unit=s.field_unit,
         gravity_mps2=s.gravity_mps2,
         field_ned=(float(north), float(east), float(down)),
         gravity_sign=GRAVITY_SIGNS[s.gravity_sign],
         magnetometer_polarity=_signs(s.polarity[Sensor.MAGNETOMETER]),
         accelerometer_polarity=_signs(s.polarity[Sensor.ACCELEROMETER]),
         gyroscope_polarity=_signs(s.polarity[Sensor.GYROSCOPE]),
-        imu_rate_hz=imu_rate_hz,
-        magnetometer_rate_hz=magnetometer_rate_hz,
-        full=full,
-        forgetting=forgetting,
         max_condition=parameters.ellipsoid_max_condition,
         max_scale_sd=parameters.ellipsoid_max_scale_sd,
         max_residual=parameters.ellipsoid_max_residual,

@@ -17,7 +17,7 @@ from fieldcal.cli.drift import drift
 from fieldcal.cli.fly import apply, compare, export
 from fieldcal.cli.interrupt import interruptible
 from fieldcal.cli.look import init, inspect
-from fieldcal.cli.onboard import onboard
+from fieldcal.cli.onboard import onboard, refit
 from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
 from fieldcal.cli.prune import prune
 from fieldcal.cli.report import report as report_command
@@ -428,3 +428,4 @@ app.command(withdraw)
 app.command(accept)
 app.command(apply)
 app.command(onboard)
+app.command(refit)

@@ -27,7 +27,9 @@ class BoardSettings:
     Attributes
     ----------
     field_norm, gravity_mps2 : float
-        Lengths of the local field, in the unit wanted for the magnetometer, and of gravity.
+        Lengths of the local field, in `field_unit`, and of gravity.
+    field_unit : str
+        Wanted for the magnetometer.
     field_ned : (3,)
         Direction of the field: north, east, down.
     gravity_sign : {1.0, -1.0}
@@ -53,6 +55,7 @@ class BoardSettings:
     """
 
     field_norm: float = 1.0
+    field_unit: str = "norm"
     gravity_mps2: float = 9.80665
     field_ned: Triple = (1.0, 0.0, 0.0)
     gravity_sign: float = 1.0

@@ -49,7 +49,7 @@ def config_header(settings: BoardSettings, told: str = "") -> str:
     s = settings
     lines = [
         ("FULL_MATRIX", str(int(s.full)), "1: room for symmetric scale matrices"),
-        ("FIELD_NORM", _float(s.field_norm), "length of the local field, in the unit wanted for the magnetometer"),
+        ("FIELD_NORM", _float(s.field_norm), f"{s.field_unit}: length of the local field"),
         ("FIELD_NED", _array(s.field_ned), "its direction"),
         ("GRAVITY", _float(s.gravity_mps2), "m/s^2"),
         ("GRAVITY_SIGN", _float(s.gravity_sign), "of the accelerometer on the down axis at rest"),

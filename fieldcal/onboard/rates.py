@@ -68,6 +68,11 @@ def shares(block_samples: int) -> Array:
     return parabola / (block_samples * (block_samples**2 - 1) / 12.0)
 
 
+def noise_kept(block_samples: int) -> float:
+    """Share of a reading's noise variance that its mean over a block keeps."""
+    return float(np.sum(shares(block_samples) ** 2))
+
+
 def equations_of_blocks(t_s: Array, q: Array, x: Array) -> tuple[Array, Array, Array]:
     """Readings' means x (k, 3) and body rates y (k, 3), rad/s, of blocks: stamps (k, m), attitudes (k, m, 4), readings
     (k, m, 3); and whether each block could be used (k,)."""
@@ -122,7 +127,7 @@ def fit_rates(
     noise: Array,
     differences: int,
     *,
-    block_samples: int,
+    noise_kept: float,
     n_samples: int,
     polarity: Triple = (1.0, 1.0, 1.0),
     max_scale_sd: float = 0.05,
@@ -132,12 +137,15 @@ def fit_rates(
     Parameters
     ----------
     sums : (33,) array
-        Of the equations of blocks of `block_samples` readings.
+        Of the blocks' equations.
     centre : (3,) array
         What was taken off the readings.
     noise : (3,) array
         Sums of the readings' squared third differences (`noise.NoiseStream`), of which there are `differences`: their
         noise would pull the scales towards zero.
+    noise_kept : float
+        Share of a reading's noise that its mean over a block keeps (`noise_kept`).
+    n_samples : int
     polarity : (3,) of ±1
     max_scale_sd : float
         Greatest relative sd of a scale.
@@ -159,12 +167,12 @@ def fit_rates(
     weight, pairs = float(sums[WEIGHT]), float(sums[PAIRS])
     codes: list[ReasonCode | None] = [ReasonCode.TOO_FEW_SAMPLES] * 3
     out = np.full((7, 3), np.nan)
-    own, kept = variance_of(noise, differences), float(np.sum(shares(block_samples) ** 2))
+    own = variance_of(noise, differences)
     for i in range(3) if weight >= FEWEST_BLOCKS and pairs > 1 else ():
         s = sums[AXIS + OF_AXIS * i : AXIS + OF_AXIS * (i + 1)]
         mean_x, mean_y = s[X] / weight, s[Y] / weight
         xx, xy, yy = s[XX] / weight - mean_x**2, s[XY] / weight - mean_x * mean_y, s[YY] / weight - mean_y**2
-        clean = xx - (0.0 if own is None else own[i] * kept)
+        clean = xx - (0.0 if own is None else own[i] * noise_kept)
         if not (clean > 0.5 * xx and xx > 0):
             codes[i] = ReasonCode.GYRO_NOT_EXCITED
             continue

@@ -179,11 +179,11 @@ class RateEquations:
         self.values: Array = np.zeros(rates.SUMS)
         self.noise = NoiseStream(in_mean, self.dtype)
         self.n_samples = 0
-        self._break()
         self._last_us: float | None = None
+        self.gap()
 
-    def _break(self) -> None:
-        """What comes next does not follow on what came before."""
+    def gap(self) -> None:
+        """What comes next does not follow on what came before: a new block begins."""
         self._pending: Array = np.empty((0, 8))
         self._before: tuple[Array, Array] | None = None
         self.noise.gap()
@@ -202,7 +202,7 @@ class RateEquations:
         bounds = [0, *starts[starts > 0].tolist(), len(t)]
         for a, b in pairwise(bounds):
             if b > a and (a in starts or not finite[a]):
-                self._break()
+                self.gap()
             if b > a and finite[a] and self.centre is not None:
                 self._feed_run(t[a:b], e[a:b], z[a:b] - self.centre)
                 self._last_us = float(t[b - 1])
@@ -247,7 +247,7 @@ class RateEquations:
         self.values += rates.recentred(other.values, other.centre.astype(float) - self.centre.astype(float))
         self.noise.merge(other.noise)
         self.n_samples += other.n_samples
-        self._break()
+        self.gap()
 
     def solve(self, polarity: Triple = (1.0, 1.0, 1.0), max_scale_sd: float = 0.05) -> RatesFit:
         """Scale and bias of the gyroscope's axes, judged (`rates.fit_rates`)."""
@@ -256,7 +256,7 @@ class RateEquations:
             np.zeros(3) if self.centre is None else self.centre.astype(float),
             self.noise.squares,
             self.noise.n_differences,
-            block_samples=self.block_samples,
+            noise_kept=rates.noise_kept(self.block_samples),
             n_samples=self.n_samples,
             polarity=polarity,
             max_scale_sd=max_scale_sd,

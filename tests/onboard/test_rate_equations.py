@@ -116,7 +116,7 @@ def test_a_gap_begins_a_new_block() -> None:
     own, halves = RateEquations(BLOCK), RateEquations(BLOCK)
     own.feed(late, q, counts)
     halves.feed(t[:3007], q[:3007], counts[:3007])
-    halves._break()
+    halves.gap()
     halves.feed(late[3007:], q[3007:], counts[3007:])
     np.testing.assert_array_equal(own.values, halves.values)
     broken = counts.copy()
