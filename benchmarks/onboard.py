@@ -21,7 +21,9 @@ import numpy as np
 from onboard_peers import PEERS
 
 import fieldcal
+from fieldcal.api.onboard import settings_of_board
 from fieldcal.geometry.rotation import Array
+from fieldcal.logs import find_logs
 from fieldcal.onboard import Board, BoardSettings, Limits, Moments, write_sources
 from fieldcal.onboard.moments import translate
 from fieldcal.onboard.noise import readings_in_mean
@@ -143,26 +145,16 @@ def logs(folders: list[Path]) -> None:
             )
     for folder in folders:
         config = folder / "fieldcal.toml" if (folder / "fieldcal.toml").is_file() else None
-        for log in (path for at in sorted(folder.iterdir()) if at.is_dir() for path in recordings(at)):
-            try:
-                recording = fieldcal.read_log(log, config=config, vehicle=log.relative_to(folder).parts[0])
-                made = recorded(recording)
-            except (fieldcal.FieldcalError, KeyError, ValueError) as error:
-                print(f"| {log.relative_to(folder)} | – | {type(error).__name__} | – | – |", flush=True)
-                continue
+        for log in find_logs(folder):
+            recording = fieldcal.read_log(log.path, config=config, vehicle=log.vehicle_id)
+            made = recorded(recording, settings_of_board(log.vehicle_id, config))
             if made is None:
-                print(f"| {log.relative_to(folder)} | – | no magnetometer or no IMU | – | – |", flush=True)
+                print(f"| {log.log_uri} | – | no magnetometer or no IMU | – | – |", flush=True)
             else:
-                print(compared(str(log.relative_to(folder)), *made), flush=True)
+                print(compared(log.log_uri, *made), flush=True)
 
 
-def recordings(folder: Path) -> list[Path]:
-    from fieldcal.logs import find_logs
-
-    return [log.path for log in find_logs(folder)]
-
-
-def recorded(recording: fieldcal.Recording) -> tuple[BoardSettings, np.ndarray] | None:
+def recorded(recording: fieldcal.Recording, board: BoardSettings) -> tuple[BoardSettings, np.ndarray] | None:
     """The IMU's samples, the magnetometer's reading with the first one after it."""
     if not {"imu", "magnetometer"} <= set(recording.tables):
         return None
@@ -179,9 +171,8 @@ def recorded(recording: fieldcal.Recording) -> tuple[BoardSettings, np.ndarray] 
         columns = [imu[f"{name}_{axis}"].to_numpy() for axis in "xyz"]
         out[name] = np.column_stack(columns)
     out["field"][at] = np.column_stack([field[f"magnetometer_{axis}"].to_numpy() for axis in "xyz"])[which]
-    strength = float(np.nanmedian(np.linalg.norm(out["field"][at] - np.nanmean(out["field"][at], axis=0), axis=1)))
     imu_hz, field_hz = (1e9 / float(np.median(np.diff(x))) for x in (t_ns, field_ns))
-    return BoardSettings(field_norm=strength or 1.0, imu_rate_hz=imu_hz, magnetometer_rate_hz=field_hz), out
+    return replace(board, imu_rate_hz=imu_hz, magnetometer_rate_hz=field_hz), out
 
 
 def compared(name: str, settings: BoardSettings, flight: np.ndarray) -> str:

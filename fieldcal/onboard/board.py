@@ -18,6 +18,7 @@ from fieldcal.onboard.rates import RatesFit
 from fieldcal.onboard.streams import Moments, RateEquations
 
 FEWEST_IN_BLOCK, MOST_IN_BLOCK = 3, 256
+MAX_LENGTH_EXCESS = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +48,8 @@ class BoardSettings:
         Factor a block of the gyroscope's equations; 1: nothing is forgotten.
     max_condition, max_scale_sd, max_residual, gyroscope_max_scale_sd : float
         Refused beyond.
+    max_length_excess : float
+        A sample whose calibrated field or gravity is further from its length, relative, makes no attitude.
 
     Examples
     --------
@@ -72,6 +75,7 @@ class BoardSettings:
     max_condition: float = 50.0
     max_scale_sd: float = 0.05
     max_residual: float = 0.1
+    max_length_excess: float = MAX_LENGTH_EXCESS
     gyroscope_max_scale_sd: float = 0.05
 
     @property
@@ -96,6 +100,11 @@ class BoardSettings:
             max_scale_sd=self.max_scale_sd,
             max_residual=self.max_residual,
         )
+
+
+def undisturbed(vectors: Array, lengths: tuple[float, float], most: float = MAX_LENGTH_EXCESS) -> np.ndarray:
+    """Which samples (n,) of calibrated field and gravity (n, 2, 3) are as long as those are, but for a share."""
+    return np.asarray((np.abs(np.linalg.norm(vectors, axis=2) / lengths - 1.0) <= most).all(axis=1))
 
 
 def block_samples_at(rate_hz: float, block_s: float = 0.1) -> int:
@@ -194,13 +203,15 @@ class Board:
             self.gyroscope.feed(t[both], self.attitudes(h[both], a[both]), w[both])
 
     def attitudes(self, magnetometer: Array, accelerometer: Array) -> Array:
-        """Attitudes (n, 4) of the sensors' axes from readings (n, 3) of both triads (Eq. 9)."""
+        """Attitudes (n, 4) of the sensors' axes from readings (n, 3) of both triads (Eq. 9); NaN where one is too long
+        or too short."""
         assert self.vectors is not None, "the vector triads are not known"
         (scale_h, bias_h), (scale_a, bias_a) = self.vectors
         s = self.settings
         seen = np.stack([magnetometer @ scale_h.T + bias_h, accelerometer @ scale_a.T + bias_a], axis=1)
         known = np.array([s.field_ned, (0.0, 0.0, s.gravity_sign)])
-        return wahba.attitudes(seen, known, s.direction_sd).q
+        q = wahba.attitudes(seen, known, s.direction_sd).q
+        return np.where(undisturbed(seen, (s.field_norm, s.gravity_mps2), s.max_length_excess)[:, None], q, np.nan)
 
     def solve(self) -> BoardResult:
         """Constants of the three triads by what has been fed so far."""

@@ -60,6 +60,7 @@ def config_header(settings: BoardSettings, told: str = "") -> str:
         ("MAX_CONDITION", _float(s.max_condition), ""),
         ("MAX_SCALE_SD", _float(s.max_scale_sd), "relative"),
         ("MAX_RESIDUAL", _float(s.max_residual), "rms of length / magnitude - 1"),
+        ("MAX_LENGTH_EXCESS", _float(s.max_length_excess), "relative: a sample further off makes no attitude"),
         ("GYROSCOPE_MAX_SCALE_SD", _float(s.gyroscope_max_scale_sd), "relative"),
         (
             "MAGNETOMETER_CORRELATED",

@@ -138,6 +138,9 @@ def test_refusals() -> None:
     assert contrary.solve((1.0, 1.0, 1.0)).reason_code == (ReasonCode.POLARITY_CONTRADICTION, None, None)
     uncertain = contrary.solve(SIGNS, max_scale_sd=1e-9)
     assert set(uncertain.reason_code) == {ReasonCode.SCALE_UNCERTAIN}
+    spoilt = RateEquations(BLOCK)
+    spoilt.feed(t, multiply(q, from_rotation_vector(0.5 * np.random.default_rng(6).normal(size=(len(q), 3)))), counts)
+    assert ReasonCode.GYRO_CONTRADICTS_ATTITUDE in spoilt.solve(SIGNS, max_scale_sd=1.0).reason_code
     with pytest.raises(ValueError, match="3 to 256"):
         RateEquations(2)
     with pytest.raises(ValueError, match="nothing was forgotten"):

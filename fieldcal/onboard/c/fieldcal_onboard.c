@@ -20,6 +20,7 @@ static const uint32_t FEWEST_SAMPLES = 50u;
 static const uint32_t FEWEST_BLOCKS = 10u;
 static const double THIRD_DIFFERENCE = 20.0; /* 1 + 9 + 9 + 1: its variance over the noise's */
 static const double CHANCE = 3.0;            /* sd of excess that are taken for chance */
+static const double MOST_LEFT = 0.4;         /* residual over what the gyroscope explains, rms */
 static const double LEAST_EXCESS = 0.01;     /* of readings that no noise is seen of, but their converter's */
 
 /* Exponents of x, y, z of every moment; those beyond the first 25 only a full matrix needs. Degrees fall from the end. */
@@ -165,7 +166,7 @@ void fieldcal_moments_gap(fieldcal_moments *moments)
 
 fieldcal_code fieldcal_moments_feed(fieldcal_moments *m, const float reading[3])
 {
-    if (!is_finite(reading[0]) || !is_finite(reading[1]) || !is_finite(reading[2])) {
+    if (!is_finite(reading[0]) || !is_finite(reading[1]) || !is_finite(reading[2]) || (m->samples == UINT32_MAX)) {
         noise_gap(&m->noise);
         return FIELDCAL_NOT_FED;
     }
@@ -992,8 +993,7 @@ fieldcal_code fieldcal_rates_start(fieldcal_rates *g, uint32_t block_samples, fl
     return FIELDCAL_OK;
 }
 
-/* What comes next does not follow on what came before. */
-static void rates_gap(fieldcal_rates *g)
+void fieldcal_rates_gap(fieldcal_rates *g)
 {
     noise_gap(&g->noise);
     g->in_block = 0u;
@@ -1082,15 +1082,15 @@ fieldcal_code fieldcal_rates_feed(fieldcal_rates *g, uint32_t t_us, uint32_t max
     for (int i = 0; i < 3; i++) {
         sound = sound && is_finite(reading[i]) && is_finite(q[i]);
     }
-    if (!sound || !is_finite(q[3])) {
-        rates_gap(g);
+    if (!sound || !is_finite(q[3]) || (g->samples == UINT32_MAX)) {
+        fieldcal_rates_gap(g);
         return FIELDCAL_NOT_FED;
     }
     if (!is_finite(g->centre[0])) {
         (void)memcpy(g->centre, reading, sizeof(g->centre));
     }
     if ((g->samples > 0u) && ((uint32_t)(t_us - g->last_us) > max_gap_us)) {
-        rates_gap(g);
+        fieldcal_rates_gap(g);
     }
     for (int i = 0; i < 3; i++) {
         x[i] = reading[i] - g->centre[i];
@@ -1163,7 +1163,7 @@ fieldcal_code fieldcal_rates_merge(fieldcal_rates *into, const fieldcal_rates *f
     }
     into->samples += from->samples;
     noise_merge(&into->noise, &from->noise);
-    rates_gap(into);
+    fieldcal_rates_gap(into);
     return FIELDCAL_OK;
 }
 
@@ -1234,6 +1234,8 @@ void fieldcal_rates_solve(const fieldcal_rates *g, const float polarity[3], floa
         fit->code[i] = FIELDCAL_OK;
         if (!(fit->scale_sd[i] <= (max_scale_sd * fabsf(fit->scale[i])))) {
             fit->code[i] = FIELDCAL_SCALE_UNCERTAIN;
+        } else if (variance > (MOST_LEFT * MOST_LEFT * scale * scale * clean)) {
+            fit->code[i] = FIELDCAL_CONTRADICTS;
         } else if ((fit->scale[i] * polarity[i]) < 0.0f) {
             fit->code[i] = FIELDCAL_WRONG_SIGN;
         } else {
@@ -1389,7 +1391,7 @@ fieldcal_code fieldcal_rates_load(fieldcal_rates *g, const uint8_t *buffer, size
     }
     g->block_samples = block;
     g->forgetting = 1.0f;
-    rates_gap(g);
+    fieldcal_rates_gap(g);
     return FIELDCAL_OK;
 }
 
@@ -1436,8 +1438,14 @@ fieldcal_code fieldcal_feed(fieldcal_board *board, uint32_t t_us, const float gy
                 b[0][i] = dot(board->scale[0][i], magnetometer) + board->bias[0][i];
                 b[1][i] = dot(board->scale[1][i], accelerometer) + board->bias[1][i];
             }
-            if (fieldcal_attitude_quest(b, r, SIGMA, q) == FIELDCAL_OK) {
+            const float field = sqrtf(dot(b[0], b[0])) / FIELDCAL_FIELD_NORM;
+            const float gravity = sqrtf(dot(b[1], b[1])) / FIELDCAL_GRAVITY;
+            const bool alone = (fabsf(field - 1.0f) <= FIELDCAL_MAX_LENGTH_EXCESS) &&
+                               (fabsf(gravity - 1.0f) <= FIELDCAL_MAX_LENGTH_EXCESS);
+            if (alone && (fieldcal_attitude_quest(b, r, SIGMA, q) == FIELDCAL_OK)) {
                 code = fieldcal_rates_feed(&board->gyroscope, t_us, FIELDCAL_MAX_GAP_US, q, gyroscope);
+            } else {
+                fieldcal_rates_gap(&board->gyroscope);
             }
         }
     }

@@ -43,7 +43,8 @@ typedef enum {
     FIELDCAL_WRONG_SIGN = 8,          /* a scale's sign contradicts the polarity (polarity_contradiction) */
     FIELDCAL_NOT_MERGEABLE = 9,       /* other block length, or something was forgotten */
     FIELDCAL_BAD_DUMP = 10,           /* not a dump, damaged, or of another sensor or build */
-    FIELDCAL_WRONG_ARGUMENT = 11
+    FIELDCAL_WRONG_ARGUMENT = 11,
+    FIELDCAL_CONTRADICTS = 12 /* the attitudes do not turn as the gyroscope does (gyro_contradicts_attitude) */
 } fieldcal_code;
 
 typedef enum { FIELDCAL_MAGNETOMETER = 0, FIELDCAL_ACCELEROMETER = 1, FIELDCAL_GYROSCOPE = 2 } fieldcal_sensor;
@@ -155,6 +156,7 @@ fieldcal_code fieldcal_rates_start(fieldcal_rates *rates, uint32_t block_samples
 /* t_us: a clock that may wrap; more than max_gap_us after the last sample a new block begins. */
 fieldcal_code fieldcal_rates_feed(fieldcal_rates *rates, uint32_t t_us, uint32_t max_gap_us, const float q[4],
                                   const float reading[3]);
+void fieldcal_rates_gap(fieldcal_rates *rates); /* the next sample does not follow on the last */
 fieldcal_code fieldcal_rates_merge(fieldcal_rates *into, const fieldcal_rates *from);
 void fieldcal_rates_solve(const fieldcal_rates *rates, const float polarity[3], float max_scale_sd,
                           fieldcal_gyroscope_fit *fit);
@@ -186,7 +188,8 @@ typedef struct {
 
 void fieldcal_start(fieldcal_board *board);
 /* One sample of the IMU; magnetometer NULL where it has no new reading. The gyroscope's equations are fed from when the
-   vector triads are known: by fieldcal_solve, or fieldcal_set_vectors with earlier constants. */
+   vector triads are known: by fieldcal_solve, or fieldcal_set_vectors with earlier constants; not where another
+   acceleration or field makes a vector too long or too short. */
 fieldcal_code fieldcal_feed(fieldcal_board *board, uint32_t t_us, const float gyroscope[3], const float accelerometer[3],
                             const float *magnetometer);
 void fieldcal_set_vectors(fieldcal_board *board, float magnetometer_scale[3][3], const float magnetometer_bias[3],

@@ -15,7 +15,7 @@ from fieldcal.estimation import wahba
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import VECTOR_SENSORS, Sensor
-from fieldcal.onboard.board import block_samples_at
+from fieldcal.onboard.board import block_samples_at, undisturbed
 from fieldcal.onboard.noise import readings_in_mean
 from fieldcal.onboard.streams import Moments, RateEquations
 from fieldcal.stages.attitude import body_vectors, known_vectors, reference_vectors, sensor_attitude
@@ -126,6 +126,7 @@ def _rate_equations(tables: Tables, s: MomentsSettings) -> tuple[RateEquations, 
     )
     vectors = body_vectors(samples, known_vectors(tables, s), s, prefix="")
     q = sensor_attitude(wahba.attitudes(vectors, reference_vectors(vectors, s)[0], EQUAL_TRUST).q, s)
+    q[~undisturbed(vectors, (float(np.linalg.norm(s.field_ned)), s.gravity_mps2))] = np.nan
     for a, b in run_bounds(segment):
         equations.feed((t_ns[a:b] - t_ns[0]) * 1e-3, q[a:b], values[a:b])
         equations.gap()
