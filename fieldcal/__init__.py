@@ -64,6 +64,7 @@ __all__ = [
     "OutputErrorFit",
     "Part",
     "Recording",
+    "Refit",
     "Refused",
     "SensorCalibration",
     "SimulatedFlight",
@@ -143,6 +144,7 @@ _NAMES_OF = {
         "Written",
     ),
     "exports.handed_out": ("HandedOut",),
+    "exports.refit": ("Refit",),
     "simulation.archive": ("write_flights",),
     "simulation.experiment": (
         "Experiment",
@@ -179,6 +181,7 @@ if TYPE_CHECKING:
     from fieldcal.exports.autopilots.comparison import Compared
     from fieldcal.exports.calibration import Constants, Export, Triad, Written
     from fieldcal.exports.handed_out import HandedOut
+    from fieldcal.exports.refit import Refit
     from fieldcal.simulation.archive import write_flights
     from fieldcal.simulation.experiment import Experiment, SimulatedFlight, simulate
     from fieldcal.warehouse.errors import WarehouseError

@@ -83,7 +83,7 @@ class Machine:
 
     def build_host(self, program: str, folder: Path, place: Path) -> None:
         needs("cc")
-        sanitizers = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+        sanitizers = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
         sources = (folder / "fieldcal_onboard.c", PROGRAMS / program)
         run("cc", *WARNINGS, *sanitizers, "-I", folder, *sources, "-lm", "-o", place, cwd=folder)
 

@@ -73,6 +73,21 @@ class Refit:
         What was found, and why it is refused.
     rows : list of dict
         The same as rows of `calibration`, method "moments".
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import fieldcal
+    >>> from fieldcal.onboard import Moments, dump
+    >>> moments = Moments()
+    >>> moments.feed(fieldcal.simulate(seed=1).counts["magnetometer"])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     board = Path(folder, "board.bin")
+    ...     _ = board.write_bytes(dump("magnetometer", moments))
+    ...     [one] = fieldcal.Warehouse(folder).refit(dumps=[board])
+    >>> str(one.sensor), one.n_flights, one.n_samples, str(one.rows[0]["method"])
+    ('magnetometer', 1, 7400, 'moments')
     """
 
     unit_id: str
