@@ -23,7 +23,8 @@ CHANCE = 3.0
 """Sd of `excess` that are taken for chance."""
 LEAST_EXCESS = 0.01
 """Of readings that no noise is seen of, but their converter's."""
-MOST_STEPS = 10
+MOST_STEPS = 40
+"""Newton's take four to six."""
 
 TERMS = ((2, 0, 0), (0, 2, 0), (0, 0, 2), (0, 1, 1), (1, 0, 1), (1, 1, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0))
 """xx yy zz yz xz xy x y z 1, of which a quadric is the sum."""
@@ -209,24 +210,31 @@ def _directions(full: bool) -> Array:
 def _adjusted_quadric(m: Array, v: Array, full: bool) -> tuple[Array, Array, float] | None:
     """Quadric (10,), the moments without noise, and the factor of v at which nothing of the least mean square is left.
 
-    It is concave in the factor, so that Newton's steps from 0 close in. None where the moments are no readings'."""
+    It is concave in the factor: Newton's steps, halved where they leave too little of the moments. None where there is
+    no quadric even at 0."""
     free = _directions(full)
     sphere = np.zeros(10)
     sphere[:3] = 1.0
-    factor = 0.0
-    for _ in range(MOST_STEPS):
+    factor, least, most = 0.0, 0.0, np.inf
+    for step in range(MOST_STEPS):
         clean = without_noise(m, factor * v)
         matrix = clean[PRODUCT]
         h = free @ matrix @ free.T
-        if not _positive(h):
+        following = 0.5 * (least + factor)
+        if _positive(h):
+            quadric = sphere - free.T @ np.linalg.solve(h, free @ matrix @ sphere)
+            left = float(quadric @ matrix @ quadric)
+            slope = float(quadric @ noise_slope(clean, v)[PRODUCT] @ quadric)
+            least, most = (factor, most) if left >= 0.0 else (least, factor)
+            following = max(factor - left / slope, least)
+            if abs(following - factor) <= 1e-9 * following or step == MOST_STEPS - 1:
+                return quadric, clean, following
+        elif step == 0:
             return None
-        quadric = sphere - free.T @ np.linalg.solve(h, free @ matrix @ sphere)
-        slope = noise_slope(clean, v)[PRODUCT]
-        change = float((quadric @ matrix @ quadric) / (quadric @ slope @ quadric))
-        factor = max(factor - change, 0.0)
-        if abs(change) <= 1e-9 * factor:
-            break
-    return quadric, clean, factor
+        else:
+            most = factor
+        factor = following if following < most else 0.5 * (least + most)
+    return None
 
 
 def _positive(matrix: Array) -> bool:

@@ -107,6 +107,16 @@ def test_other_accelerations_make_it_less_certain_not_wrong() -> None:
     assert np.abs(np.diagonal(swaying.scale - SCALE) / np.diagonal(swaying.scale_sd)).max() < 3.0
 
 
+def test_noise_as_large_as_a_tenth_of_the_field_is_no_hindrance() -> None:
+    """Newton's first step goes further than the moments allow."""
+    rng = np.random.default_rng(21)
+    z = readings(tilting(rng, 20000, 75.0), SCALE, BIAS, 0.1, rng)
+    fit = solve(z, max_residual=0.5, max_scale_sd=0.1, full=True, max_condition=200.0)
+    assert fit.reason_code is None
+    assert np.abs(np.diagonal(fit.scale - SCALE) / np.diagonal(fit.scale_sd)).max() < 3.0
+    np.testing.assert_allclose(fit.noise_sd, 0.1, rtol=0.05)
+
+
 @pytest.mark.parametrize("full", [False, True])
 def test_units_axes_pieces_and_centres_do_not_matter(full: bool) -> None:
     rng = np.random.default_rng(8)

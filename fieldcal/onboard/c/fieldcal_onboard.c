@@ -19,6 +19,7 @@ static const float LARGEST = 1.0e8f;       /* of a reading less its centre: its 
 static const uint32_t FEWEST_SAMPLES = 50u;
 static const uint32_t FEWEST_BLOCKS = 10u;
 static const double THIRD_DIFFERENCE = 20.0; /* 1 + 9 + 9 + 1: its variance over the noise's */
+#define MOST_STEPS 40 /* Newton's take four to six */
 static const double CHANCE = 3.0;            /* sd of excess that are taken for chance */
 static const double MOST_LEFT = 0.4;         /* residual over what the gyroscope explains, rms */
 static const double LEAST_EXCESS = 0.01;     /* of readings that no noise is seen of, but their converter's */
@@ -767,22 +768,39 @@ fieldcal_code fieldcal_moments_solve(const fieldcal_moments *moments, const fiel
         v[i] = (v[i] > 1.0e-12) ? v[i] : 1.0e-12;
     }
     /* How axes share the noise their differences say; how much there is, the residuals: the factor of v at which nothing
-       of them is left. The least mean square is concave in it, so that Newton's steps from 0 close in. */
+       of them is left. The least mean square is concave in it: Newton's steps, halved where they leave too little of the
+       moments. */
     double factor_of_v = 0.0;
-    for (int step = 0; step < 10; step++) {
+    double least = 0.0;
+    double most = -1.0; /* not known */
+    bool found = false;
+    for (int step = 0; (step < MOST_STEPS) && !found; step++) {
         const double w[3] = {factor_of_v * v[0], factor_of_v * v[1], factor_of_v * v[2]};
+        double next = 0.5 * (least + factor_of_v);
         without_noise(raw, w, clean);
-        if (!least_quadric(clean, limits->full, quadric)) {
+        if (least_quadric(clean, limits->full, quadric)) {
+            noise_slope(clean, v, slope);
+            const double left = between(clean, quadric, quadric);
+            next = factor_of_v - (left / between(slope, quadric, quadric));
+            if (left >= 0.0) {
+                least = factor_of_v;
+            } else {
+                most = factor_of_v;
+            }
+            next = (next > least) ? next : least;
+            found = (fabs(next - factor_of_v) <= (1.0e-9 * next)) || (step == (MOST_STEPS - 1));
+        } else if (step == 0) {
             return fit->code;
+        } else {
+            most = factor_of_v;
         }
-        noise_slope(clean, v, slope);
-        const double left = between(clean, quadric, quadric);
-        const double change = left / between(slope, quadric, quadric);
-        factor_of_v -= change;
-        factor_of_v = (factor_of_v > 0.0) ? factor_of_v : 0.0;
-        if (fabs(change) <= (1.0e-9 * factor_of_v)) {
-            break;
+        if (!found && (most >= 0.0) && (next >= most)) {
+            next = 0.5 * (least + most);
         }
+        factor_of_v = next;
+    }
+    if (!found) {
+        return fit->code;
     }
     if (!triad_of(quadric, scale, bias)) {
         return fit->code;
