@@ -149,29 +149,31 @@ def logs(folders: list[Path]) -> None:
             recording = fieldcal.read_log(log.path, config=config, vehicle=log.vehicle_id)
             made = recorded(recording, settings_of_board(log.vehicle_id, config))
             if made is None:
-                print(f"| {log.log_uri} | – | no magnetometer or no IMU | – | – |", flush=True)
+                print(f"| {log.log_uri} | – | no IMU | – | – |", flush=True)
             else:
                 print(compared(log.log_uri, *made), flush=True)
 
 
 def recorded(recording: fieldcal.Recording, board: BoardSettings) -> tuple[BoardSettings, np.ndarray] | None:
-    """The IMU's samples, the magnetometer's reading with the first one after it."""
-    if not {"imu", "magnetometer"} <= set(recording.tables):
+    """The IMU's samples, the magnetometer's reading with the first one after it; None where there is no IMU."""
+    imu, field = recording.tables.get("imu"), recording.tables.get("magnetometer")
+    if imu is None or imu.height < 100 or imu["accelerometer_x"].null_count():
         return None
-    imu, field = recording.tables["imu"], recording.tables["magnetometer"]
-    if imu.height < 100 or field.height < 100:
-        return None
-    t_ns, field_ns = imu["t_ns"].to_numpy(), field["t_ns"].to_numpy()
+    t_ns = imu["t_ns"].to_numpy()
     out = np.zeros(imu.height, dtype=SAMPLE)
     out["t_us"] = ((t_ns - t_ns[0]) // 1000) % 2**32
-    at = np.searchsorted(t_ns, field_ns)
-    at, which = np.unique(at[at < len(t_ns)], return_index=True)
-    out["has_field"][at] = 1
+    imu_hz = 1e9 / float(np.median(np.diff(t_ns)))
     for name in ("gyroscope", "accelerometer"):
         columns = [imu[f"{name}_{axis}"].to_numpy() for axis in "xyz"]
         out[name] = np.column_stack(columns)
+    if field is None or field.height < 100:
+        return replace(board, imu_rate_hz=imu_hz), out
+    field_ns = field["t_ns"].to_numpy()
+    at = np.searchsorted(t_ns, field_ns)
+    at, which = np.unique(at[at < len(t_ns)], return_index=True)
+    out["has_field"][at] = 1
     out["field"][at] = np.column_stack([field[f"magnetometer_{axis}"].to_numpy() for axis in "xyz"])[which]
-    imu_hz, field_hz = (1e9 / float(np.median(np.diff(x))) for x in (t_ns, field_ns))
+    field_hz = 1e9 / float(np.median(np.diff(field_ns)))
     return replace(board, imu_rate_hz=imu_hz, magnetometer_rate_hz=field_hz), out
 
 

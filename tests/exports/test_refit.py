@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from history_rows import lead, rows
-from numerics_support import Array
+from numerics_support import Array, finely_integrated
 from onboard_support import readings, tilting
 
 import fieldcal
 from fieldcal.cli.main import run
+from fieldcal.geometry.rotation import from_rotation_vector, multiply
 from fieldcal.onboard import Limits, Moments, MomentsFit, RateEquations, RatesFit, dump
 from fieldcal.simulation.archive import settings, signals
 from fieldcal.simulation.experiment import Experiment, simulate
@@ -190,6 +191,43 @@ def test_names_that_are_not_there(fleet: Fleet, capsys: pytest.CaptureFixture[st
     found = json.loads(out)
     assert {r["status"] for r in found} == {"refused"}
     assert (found[0]["n_flights"], found[0]["method"], found[0]["unit_id"]) == (2, "moments", "imu-of-v")
+
+
+def test_the_gyroscopes_equations_add_up_too(tmp_path: Path) -> None:
+    scale, bias = np.array([-2.2e-4, 2.9e-4, 3.8e-4]), np.array([7.0, -9.6, -11.7])
+    t = 0.005 * np.arange(4000)
+    made, merged = [], RateEquations(20)
+    for k in range(3):
+        rng = np.random.default_rng(k)
+        q, rate = finely_integrated(t, rng, refinement=2)
+        q = multiply(q, from_rotation_vector(0.01 * rng.normal(size=(len(q), 3))))
+        own = RateEquations(20)
+        own.feed(t * 1e6, q, (rate - bias) / scale)
+        merged.merge(own)
+        sums = {"polarity": [-1.0, 1.0, 1.0], "centre": own.centre, "noise": own.noise.squares, "sums": own.values}
+        as_text = json.dumps({name: np.asarray(value).tolist() for name, value in sums.items()})
+        told = {"sensor": "gyroscope", "magnitude": None, "unit": "rad/s", "logged_unit": "counts", "block_samples": 20}
+        told |= {"n_samples": own.n_samples, "n_differences": own.noise.n_differences, "sums": as_text}
+        made.append(row("v", k, "spring", short_flight(k)) | told)
+    flights = [{**lead("v", one["flight_id"], k), "log_uri": f"v/{k}", "verdict": "ok"} for k, one in enumerate(made)]
+    frames = {"moments": rows("moments", *made), "flight": rows("flight", *flights)}
+    publish(tmp_path, "v", frames, [one["flight_id"] for one in made])
+    (one,) = fieldcal.Warehouse(tmp_path).refit("v")
+    expected = merged.solve((-1.0, 1.0, 1.0))
+    assert isinstance(one.fit, RatesFit)
+    assert (one.fit.reason_code, one.n_samples) == ((None, None, None), 12_000)
+    for name in ("scale", "bias", "scale_sd", "bias_sd"):
+        np.testing.assert_allclose(getattr(one.fit, name), getattr(expected, name), rtol=1e-9)
+    np.testing.assert_allclose(one.fit.scale, scale, rtol=0.02)
+    sd = {r["axis"]: r["sd"] for r in one.rows if r["parameter"] == "zero"}
+    assert sd["x"] == pytest.approx(np.sqrt(_zero_variance(expected, 0)))
+
+
+def _zero_variance(fit: RatesFit, axis: int) -> float:
+    """Of −b/λ to first order."""
+    to_zero = np.array([fit.bias[axis] / fit.scale[axis] ** 2, -1.0 / fit.scale[axis]])
+    own = np.array([[fit.scale_sd[axis] ** 2, fit.covariance[axis]], [fit.covariance[axis], fit.bias_sd[axis] ** 2]])
+    return float(to_zero @ own @ to_zero)
 
 
 def test_the_stage_collects_what_streams_do() -> None:
