@@ -64,6 +64,7 @@ __all__ = [
     "OutputErrorFit",
     "Part",
     "Recording",
+    "Refit",
     "Refused",
     "SensorCalibration",
     "SimulatedFlight",
@@ -87,6 +88,7 @@ __all__ = [
     "simulate",
     "synchronise",
     "write_flights",
+    "write_onboard",
 ]
 
 _NAMES_OF = {
@@ -112,6 +114,7 @@ _NAMES_OF = {
         "JointEstimate",
         "fit_joint",
     ),
+    "api.onboard": ("write_onboard",),
     "api.output_error": (
         "OutputErrorFit",
         "fit_output_error",
@@ -141,6 +144,7 @@ _NAMES_OF = {
         "Written",
     ),
     "exports.handed_out": ("HandedOut",),
+    "exports.refit": ("Refit",),
     "simulation.archive": ("write_flights",),
     "simulation.experiment": (
         "Experiment",
@@ -158,6 +162,7 @@ if TYPE_CHECKING:
     from fieldcal.api.ellipsoid import EllipsoidFit, fit_ellipsoid
     from fieldcal.api.estimate import Estimate
     from fieldcal.api.joint import JointEstimate, fit_joint
+    from fieldcal.api.onboard import write_onboard
     from fieldcal.api.output_error import OutputErrorFit, fit_output_error
     from fieldcal.api.plot import plot
     from fieldcal.api.recording import Recording, read_log
@@ -176,6 +181,7 @@ if TYPE_CHECKING:
     from fieldcal.exports.autopilots.comparison import Compared
     from fieldcal.exports.calibration import Constants, Export, Triad, Written
     from fieldcal.exports.handed_out import HandedOut
+    from fieldcal.exports.refit import Refit
     from fieldcal.simulation.archive import write_flights
     from fieldcal.simulation.experiment import Experiment, SimulatedFlight, simulate
     from fieldcal.warehouse.errors import WarehouseError

@@ -86,6 +86,8 @@ class Method(StrEnum):
     ELLIPSOID_TLS = "ellipsoid_tls"
     WARM_UP = "warm_up"
     MOTOR_FIELD = "motor_field"
+    MOMENTS = "moments"
+    """Of flights together, by `fieldcal refit`."""
 
 
 PREFERRED_METHODS = (

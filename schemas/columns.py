@@ -244,6 +244,27 @@ RUN_KEY = Column(
     "run_key", _TEXT, "", "digest of inputs, parameters, code and versions that made the row", provenance=True
 )
 
+# --- moments
+MAGNITUDE = Column(
+    "magnitude",
+    _F64,
+    "`unit`",
+    "length of the sensed vector, local field or gravity, that the readings are fitted to; null of the gyroscope",
+)
+LOGGED_UNIT = Column("logged_unit", _TEXT, "", "unit of the readings")
+READING_RATE_HZ = Column("reading_rate_hz", _F64, "Hz", "readings a second, by their median interval")
+BLOCK_SAMPLES = Column(
+    "block_samples", _I64, "1", "attitudes from which one of the gyroscope's equations was formed; 0 of other sensors"
+)
+N_DIFFERENCES = Column("n_differences", _I64, "1", "third differences in the sums that tell the readings' noise")
+SUMS = Column(
+    "sums",
+    _TEXT,
+    "",
+    "JSON object: polarity (3), centre taken off the readings (3), noise: sums of squared third differences (3), and "
+    "sums, of products of the readings to the fourth order (34) or of the gyroscope's equations (33)",
+)
+
 # --- fit
 QUANTITY = Column(
     "quantity", _TEXT, "", "what is compared: attitude, quaternion_rate, attitude_propagated or body_rate"

@@ -126,6 +126,22 @@ class _StageRun(UnitLead, Refusable):
     run_key: str | None
 
 
+class MomentsRow(UnitLead):
+    """A row of `moments`; `sums` is a JSON text."""
+
+    sensor: str
+    magnitude: float | None
+    unit: str
+    logged_unit: str
+    temperature_degc: float | None
+    reading_rate_hz: float
+    block_samples: int
+    n_samples: int
+    n_differences: int
+    sums: str
+    run_key: str | None
+
+
 class RunRow(_StageRun):
     """A row of `run`; `measured` and `versions` are JSON texts."""
 
@@ -225,6 +241,7 @@ ROWS = {
     "calibration": CalibrationRow,
     "fit": FitRow,
     "sync": SyncRow,
+    "moments": MomentsRow,
     "run": RunRow,
     "drift": DriftRow,
     "decision": DecisionRow,

@@ -222,6 +222,28 @@ _HISTORY = (
         ("flight_id", "unit_id"),
     ),
     Table(
+        "moments",
+        "history",
+        1,
+        "one row a unit and sensor of a flight: sums that can be merged, for `fieldcal refit`",
+        (
+            *c.LEAD,
+            *_UNIT,
+            c.SENSOR,
+            c.MAGNITUDE,
+            c.UNIT,
+            c.LOGGED_UNIT,
+            c.TEMPERATURE_DEGC,
+            c.READING_RATE_HZ,
+            c.BLOCK_SAMPLES,
+            c.N_SAMPLES,
+            c.N_DIFFERENCES,
+            c.SUMS,
+            c.RUN_KEY,
+        ),
+        ("flight_id", "unit_id", "sensor"),
+    ),
+    Table(
         "run",
         "history",
         3,
@@ -317,14 +339,14 @@ TABLES: dict[str, Table] = {table.name: table for table in (*_SIGNALS, *_STAGES,
 SIGNAL_TABLES = tuple(table.name for table in _SIGNALS)
 STAGE_TABLES = tuple(table.name for table in _STAGES)
 HISTORY_TABLES = tuple(table.name for table in _HISTORY)
-FLIGHT_TABLES = ("flight", "calibration", "fit", "sync", "run")
+FLIGHT_TABLES = ("flight", "calibration", "fit", "sync", "moments", "run")
 """Those of the history that nights fill, flight by flight."""
 
 UNITS_APART = "."
 """Between a signal's name and the number of a further unit on board: "imu.1"."""
 
 _NOT_AT_STAGE_LEVEL = frozenset(column.name for column in (*c.LEAD, *_UNIT, c.RUN_KEY))
-_AT_STAGE_LEVEL = ("calibration", "fit", "sync")
+_AT_STAGE_LEVEL = ("calibration", "fit", "sync", "moments")
 
 
 def table_columns(table: str, *, stage: bool = False) -> tuple[Column, ...]:

@@ -15,6 +15,7 @@ import fieldcal
 import fieldcal.errors
 import fieldcal.logs
 import fieldcal.logs.interface
+import fieldcal.onboard
 import fieldcal.warehouse.query
 from fieldcal.cli.main import app as command_line
 from fieldcal.config.parameters import PROFILES, Parameters
@@ -86,7 +87,7 @@ def python() -> str:
     """The public names of the package, its warehouse and its errors."""
     names = [name for name in getattr(fieldcal, "__all__", ()) if not name.startswith("_")]
     blocks = [_entry(f"fieldcal.{name}", _directive(getattr(fieldcal, name))) for name in names]
-    rooms = (fieldcal.warehouse.query, fieldcal.logs, fieldcal.logs.interface, fieldcal.errors)
+    rooms = (fieldcal.onboard, fieldcal.warehouse.query, fieldcal.logs, fieldcal.logs.interface, fieldcal.errors)
     blocks += [_entry(room.__name__, "automodule", [name for name in names if hasattr(room, name)]) for room in rooms]
     return "# Python\n\n" + "\n".join(blocks)
 

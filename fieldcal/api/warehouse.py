@@ -6,6 +6,7 @@ import getpass
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, Unpack
 
 import polars as pl
@@ -18,6 +19,7 @@ from fieldcal.warehouse.questions import calibration_history, existing
 if TYPE_CHECKING:
     from fieldcal.exports.calibration import Constants, Export
     from fieldcal.exports.handed_out import HandedOut
+    from fieldcal.exports.refit import Refit
     from fieldcal.warehouse.sql import Limits, SqlValue
 
 
@@ -93,8 +95,9 @@ class Warehouse(query.Warehouse):
         Parameters
         ----------
         query : str
-            One SELECT in DuckDB's dialect. Tables: flight, calibration, fit, sync, run, drift, decision, export; views:
-            latest_calibration, history, drift_by_temperature, worst_tic, refusals, active, calibration_at(°C).
+            One SELECT in DuckDB's dialect. Tables: flight, calibration, fit, sync, moments, run, drift, decision,
+            export; views: latest_calibration, history, drift_by_temperature, worst_tic, refusals, active,
+            calibration_at(°C).
         parameters : sequence, optional
             Fill its ``?`` marks.
         **limits
@@ -175,6 +178,55 @@ class Warehouse(query.Warehouse):
         from fieldcal.exports.calibration_at import what_flies
 
         return what_flies(self.root, vehicle, temperature_degc)
+
+    def refit(
+        self,
+        vehicle: str | None = None,
+        *,
+        sessions: str | None = None,
+        dumps: Sequence[Path | str] = (),
+        full: bool = False,
+        config: Path | str | None = None,
+    ) -> list[Refit]:
+        """Constants by many flights at once, from the moments that each left in the history; no log is read.
+
+        Parameters
+        ----------
+        vehicle : str, optional
+            Whose flights, those of its primary units; None: dumps alone.
+        sessions : str, optional
+            "A..B": from the first flight of session A to the last of session B; "A..", "..B", or "A" alone.
+        dumps : sequence of Path or str, optional
+            What boards have collected (`fieldcal.onboard.dump`), of the same vehicle.
+        full : bool
+            Symmetric scale matrices.
+        config : Path or str, optional
+            fieldcal.toml, for the limits of refusals, and for what a board knew of its vehicle.
+
+        Returns
+        -------
+        list of Refit
+            One a sensor and unit, with rows of method "moments".
+
+        Raises
+        ------
+        FieldcalError
+            `not_found`: no such vehicle or session, or no moments; `not_one_fit`: flights of other fields, units or
+            polarities; `bad_dump`.
+        """
+        from fieldcal.api.onboard import settings_of_board
+        from fieldcal.exports.refit import refit
+        from fieldcal.onboard.dumps import read_dumps
+
+        board = settings_of_board(vehicle, config)
+        return refit(
+            self.root,
+            vehicle,
+            sessions=sessions,
+            dumped=[state for path in dumps for state in read_dumps(path)],
+            board=board,
+            full=full,
+        )
 
     def withdraw(self, target: str, *, reason: str, author: str | None = None, **part: Unpack[Part]) -> Decided:
         """Decide that a flight, or a part of it, counts nowhere: not in trends, constants to fly with or exports. Its

@@ -17,6 +17,7 @@ from fieldcal.cli.drift import drift
 from fieldcal.cli.fly import apply, compare, export
 from fieldcal.cli.interrupt import interruptible
 from fieldcal.cli.look import init, inspect
+from fieldcal.cli.onboard import onboard, refit
 from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
 from fieldcal.cli.report import report as report_command
 from fieldcal.cli.serve import alerts_app, serve, trigger
@@ -429,3 +430,5 @@ app.command(compare)
 app.command(withdraw)
 app.command(accept)
 app.command(apply)
+app.command(onboard)
+app.command(refit)

@@ -258,6 +258,11 @@ class GyroOutputSettings(GyroSettings, TriadUncertainty):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MomentsSettings(BodyVectors, LocalField, FieldOrigin, Gravity):
+    """Stage `moments`."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class WarmUpSettings(Units):
     """Stage `warm_up`."""
 

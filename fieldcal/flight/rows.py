@@ -41,6 +41,8 @@ LEAD_SCHEMA = pl.Schema(
         "run_key": pl.String(),
     }
 )
+BY_SENSOR = ("calibration", "moments")
+"""Tables that a stage writes a sensor's rows in: of a board whose sensors are units of their own, each by its unit."""
 StageTables = Mapping[str, tuple[pl.DataFrame, str | None]]
 """`stage.table` → its rows and the run_key that made them."""
 
@@ -169,12 +171,12 @@ def published_tables(units: Sequence[tuple[FlightLead, Unit, StageTables]]) -> d
 def publishes(table: str, unit: Unit) -> bool:
     """Whether a unit has rows in a table: how attitudes agree, and what the VPS's clock is against the IMU's, tells of
     IMUs; a further magnetometer has constants only."""
-    return table == "calibration" or Sensor.GYROSCOPE in unit.ids
+    return table in BY_SENSOR or Sensor.GYROSCOPE in unit.ids
 
 
 def _by_unit_id(table: str, unit: Unit, frame: pl.DataFrame) -> list[tuple[str, pl.DataFrame]]:
     """(unit_id, rows) of what a stage found of a unit: of its sensors each by its own id."""
-    if table != "calibration":
+    if table not in BY_SENSOR:
         return [(unit.unit_id, frame)]
     sensors = {unit_id: [s for s in unit.ids if unit.ids[s] == unit_id] for unit_id in unit.ids.values()}
     return [(unit_id, frame.filter(pl.col("sensor").is_in(own))) for unit_id, own in sensors.items()]

@@ -23,6 +23,7 @@ from fieldcal.config.stage_settings import (
     JointSettings,
     MagnetometerSettings,
     ManoeuvreSettings,
+    MomentsSettings,
     S,
     SanitySettings,
     SmoothingSettings,
@@ -43,7 +44,7 @@ from fieldcal.stages import (
     vector_triads,
     vps,
 )
-from fieldcal.stages.beside import warm_up
+from fieldcal.stages.beside import moments, warm_up
 from fieldcal.stages.inputs import Tables
 from fieldcal.stages.joint import estimate
 from fieldcal.stages.results import StageResult
@@ -225,6 +226,21 @@ PIPELINE: tuple[Stage, ...] = (
         (Sensor.GYROSCOPE,),
     ),
     _stage(
+        "moments",
+        moments.collect_moments,
+        MomentsSettings,
+        {
+            **TRIAD,
+            **MAGNETOMETER,
+            "accelerometer": "accelerometer_pass2.calibration",
+            "magnetometer_log": "ingest.magnetometer",
+            "segments": "manoeuvre.segments",
+            "attitude": "attitude_pass2.attitude",
+        },
+        ("samples", "segments"),
+        ("moments",),
+    ),
+    _stage(
         "joint",
         estimate.estimate_jointly,
         JointSettings,
@@ -312,6 +328,7 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
     "calibration": ("composition.calibration",),
     "fit": ("verify.fit",),
     "sync": ("vps_sync.sync",),
+    "moments": ("moments.moments",),
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import shutil
 import signal
@@ -27,7 +28,7 @@ from fieldcal.cli.main import run
 from fieldcal.flows.run import dry_run, run_night
 from fieldcal.flows.runners import Answers
 from fieldcal.simulation.archive import write_flights
-from fieldcal.simulation.experiment import Experiment
+from fieldcal.simulation.experiment import SCALE, Experiment
 from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.content import content_sha256
@@ -98,7 +99,8 @@ def test_a_night_fills_every_table(first_night: tuple[Path, Any]) -> None:
     assert (result["ok"], len(result["logs"])) == (2, 2)
     assert (result["stages_run"], result["stages_cached"]) == (2 * len(STEPS), 0)
     warehouse = Warehouse(root)
-    rows = {table: warehouse.scan(table).collect() for table in ("flight", "calibration", "fit", "sync", "run")}
+    tables = ("flight", "calibration", "fit", "sync", "moments", "run")
+    rows = {table: warehouse.scan(table).collect() for table in tables}
     assert all(frame["flight_id"].n_unique() == 2 for frame in rows.values())
     assert set(rows["run"]["stage"]) == set(STEPS)
     assert set(rows["calibration"]["sensor"]) == {"magnetometer", "accelerometer", "gyroscope"}
@@ -107,6 +109,21 @@ def test_a_night_fills_every_table(first_night: tuple[Path, Any]) -> None:
     assert rows["flight"]["log_uri"].to_list()[0] == "sim-1/2026-01-12/flight-01.mcap"
     assert warehouse.scan("imu").collect()["flight_id"].n_unique() == 2
     assert verify(root)["ok"]
+
+
+def test_a_night_leaves_moments_that_refit_solves(first_night: tuple[Path, Any], capsys: Any) -> None:
+    root, _ = first_night
+    asked = "SELECT sensor, n_samples, json_array_length(sums, '$.sums') AS n FROM moments WHERE vehicle_id = 'sim-1'"
+    kept = Warehouse(root).sql(asked).sort("sensor")
+    assert kept["sensor"].to_list() == ["accelerometer", "gyroscope", "magnetometer"]
+    assert kept["n"].to_list() == [34, 33, 34]
+    assert run(["refit", "--vehicle", "sim-1", "--sessions", "2026-01-12", "--json", "--warehouse", str(root)]) == 0
+    found = {(r["sensor"], r["parameter"], r["axis"]): r for r in json.loads(capsys.readouterr().out)}
+    for sensor, truth in SCALE.items():
+        for axis, value in zip("xyz", truth, strict=True):
+            row = found[sensor, "scale", axis]
+            assert row["method"] == "moments"
+            assert abs(row["value"] / value - 1.0) < max(4.0 * row["sd"] / abs(row["value"]), 0.03)
 
 
 def test_an_unchanged_night_runs_nothing_and_changes_no_byte(simulated: Path, warehouse: Path) -> None:

@@ -62,7 +62,8 @@ def test_the_wheel_holds_one_package_and_its_data(wheel: Path) -> None:
     tops = {name.split("/")[0] for name in names}
     assert "fieldcal" in tops
     assert {top for top in tops if top != "fieldcal"} == {f"{'-'.join(wheel.name.split('-')[:2])}.dist-info"}
-    for needed in ("py.typed", "warehouse/views/history.sql", "report/templates/style.css", "flows/nightly.py"):
+    files = ("py.typed", "warehouse/views/history.sql", "report/templates/style.css", "onboard/c/fieldcal_onboard.h")
+    for needed in (*files, "flows/nightly.py"):
         assert f"fieldcal/{needed}" in names
     modules = {str(path.relative_to(REPOSITORY)) for path in (REPOSITORY / "fieldcal").rglob("*.py")}
     assert modules <= set(names)

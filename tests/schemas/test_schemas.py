@@ -148,6 +148,7 @@ FORMS = {
     "calibration": (3, "1829cb30"),
     "fit": (3, "1e14d746"),
     "sync": (3, "266ce3a5"),
+    "moments": (1, "4079ca46"),
     "run": (3, "ac506f44"),
     "drift": (4, "e8fac4a1"),
     "decision": (1, "ba9619df"),
