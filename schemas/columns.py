@@ -233,7 +233,8 @@ PARAMETER = Column(
     "point, to the sensor, body axes; delay behind the gyroscope or the trajectory; dip of the field; g_sensitivity of "
     "the reading to specific force (the zero is that at the flight's mean force); field_per_current, "
     "field_per_throttle: what the motors add to the reading; residual_...: of readings that an autopilot had corrected "
-    "before it logged them, beside which the others are the raw sensor's",
+    "before it logged them, beside which the others are the raw sensor's; in `information` gain, zero: reading = gain "
+    "* z + zero, so gain is 1/scale, and cross: an off-diagonal element of the matrix over its row's diagonal one",
 )
 AXIS = Column("axis", _TEXT, "", "sensor axis x, y or z; full form xx, xy, ...")
 VALUE = Column("value", _F64, "named by column unit", "estimate of the parameter; null when refused without a number")
@@ -241,6 +242,29 @@ SD = Column("sd", _F64, "named by column unit", "one standard deviation of the e
 UNIT = Column("unit", _TEXT, "", "unit of the numbers of the row that have none of their own")
 RUN_KEY = Column(
     "run_key", _TEXT, "", "digest of inputs, parameters, code and versions that made the row", provenance=True
+)
+
+# --- information
+PLACE = Column("place", _I64, "1", "number of the parameter among those of the flight and unit, from 0")
+SENSOR_UNIT_ID = Column(
+    "sensor_unit_id", _TEXT, "", "the sensor's own unit, where the units of a flight's sensors differ; else unit_id"
+)
+LINEARISED_AT = Column(
+    "linearised_at",
+    _F64,
+    "named by column unit",
+    "value p0 about which the flight's equations N (p - p0) = g are linear: the flight's joint estimate, or what the "
+    "parameter was held at; readings are centred there, so that a few per cent of a scale change N by as much",
+)
+RIGHT_SIDE = Column(
+    "right_side", _F64, "1 over column unit", "element of g: 0 where the flight alone, without its prior, is at p0"
+)
+INFORMATION = Column(
+    "information",
+    pa.list_(_F64),
+    "1 over the units of the two parameters",
+    "row of N up to its diagonal, by place: information on this parameter and each before it, the prior taken out, "
+    "attitude, translation, dip and noise levels eliminated, coloured noise in it; all 0 where nothing is known",
 )
 
 # --- fit

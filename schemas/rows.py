@@ -140,6 +140,24 @@ class UnfoldedRun(_StageRun):
     versions: Mapping[str, str] | None
 
 
+class InformationRow(UnitLead):
+    """A row of `information`."""
+
+    place: int
+    sensor: str
+    parameter: str
+    axis: str
+    sensor_unit_id: str
+    unit: str
+    linearised_at: float
+    right_side: float
+    information: list[float]
+    temperature_degc: float | None
+    status: str
+    reason_code: str | None
+    run_key: str | None
+
+
 class DriftRow(TypedDict):
     """A row of `drift`."""
 
@@ -226,6 +244,7 @@ ROWS = {
     "fit": FitRow,
     "sync": SyncRow,
     "run": RunRow,
+    "information": InformationRow,
     "drift": DriftRow,
     "decision": DecisionRow,
     "export": ExportRow,

@@ -230,6 +230,30 @@ _HISTORY = (
         ("flight_id", "unit_id", "stage"),
     ),
     Table(
+        "information",
+        "history",
+        1,
+        "one row a unit and parameter of a flight: its normal equations, what it says of all constants together",
+        (
+            *c.LEAD,
+            *_UNIT,
+            c.PLACE,
+            c.SENSOR,
+            c.PARAMETER,
+            c.AXIS,
+            c.SENSOR_UNIT_ID,
+            c.UNIT,
+            c.LINEARISED_AT,
+            c.RIGHT_SIDE,
+            c.INFORMATION,
+            c.TEMPERATURE_DEGC,
+            c.STATUS,
+            c.REASON_CODE,
+            c.RUN_KEY,
+        ),
+        ("flight_id", "unit_id", "place"),
+    ),
+    Table(
         "drift",
         "history",
         4,
@@ -317,14 +341,14 @@ TABLES: dict[str, Table] = {table.name: table for table in (*_SIGNALS, *_STAGES,
 SIGNAL_TABLES = tuple(table.name for table in _SIGNALS)
 STAGE_TABLES = tuple(table.name for table in _STAGES)
 HISTORY_TABLES = tuple(table.name for table in _HISTORY)
-FLIGHT_TABLES = ("flight", "calibration", "fit", "sync", "run")
+FLIGHT_TABLES = ("flight", "calibration", "fit", "sync", "run", "information")
 """Those of the history that nights fill, flight by flight."""
 
 UNITS_APART = "."
 """Between a signal's name and the number of a further unit on board: "imu.1"."""
 
-_NOT_AT_STAGE_LEVEL = frozenset(column.name for column in (*c.LEAD, *_UNIT, c.RUN_KEY))
-_AT_STAGE_LEVEL = ("calibration", "fit", "sync")
+_NOT_AT_STAGE_LEVEL = frozenset(column.name for column in (*c.LEAD, *_UNIT, c.SENSOR_UNIT_ID, c.RUN_KEY))
+_AT_STAGE_LEVEL = ("calibration", "fit", "sync", "information")
 
 
 def table_columns(table: str, *, stage: bool = False) -> tuple[Column, ...]:

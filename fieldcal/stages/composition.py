@@ -14,6 +14,7 @@ from fieldcal.geometry.sensor_model import through
 from fieldcal.names import RESIDUAL, SENSORS, Json, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables
+from fieldcal.stages.joint.information import equations_of, kept, of_raw, rewritten
 from fieldcal.stages.results import ZERO_SLOPE, StageResult
 from fieldcal.stages.tables import AXES, CalibrationRow, calibration_rows
 
@@ -58,7 +59,32 @@ def compose(tables: Tables, s: CompositionSettings) -> StageResult:
             residual = of_method.filter(pl.col("parameter").is_in([*COMPOSED, ZERO_SLOPE]))
             out.append(residual.with_columns(parameter=pl.lit(RESIDUAL) + pl.col("parameter")))
     measured: dict[str, Json] = {ORIGIN: _origin(s), **({"composed": composed} if composed else {})}
-    return StageResult({"calibration": pl.concat(out)}, measured=measured)
+    made = {"calibration": pl.concat(out)}
+    if "information" in tables:
+        made["information"] = _information(tables["information"], s)
+    return StageResult(made, measured=measured)
+
+
+def _information(rows: pl.DataFrame, s: CompositionSettings) -> pl.DataFrame:
+    """The same of what the flight says of all constants together; nothing of a sensor whose correction is not known."""
+    own = [
+        name
+        for name in s.own_sensors
+        if s.applied_matrix[name] is None or s.applied_offset[name] is None or s.applied_known[name]
+    ]
+    names = rows.filter(pl.col("sensor").is_in(own)).select("sensor", "parameter", "axis")
+    rows = kept(rows, set(names.iter_rows()))
+    if rows.is_empty():
+        return rows
+    found = equations_of(rows)
+    for sensor in own:
+        matrix, offset = s.applied_matrix[sensor], s.applied_offset[sensor]
+        if matrix is None or offset is None or (str(sensor), "zero", "x") not in found.names:
+            continue
+        slope, offset_sd = (np.array(x[sensor] or (0.0,) * 3) for x in (s.applied_offset_per_degc, s.applied_offset_sd))
+        uncertain = s.applied_matrix_sd[sensor] or 0.0, offset_sd
+        found = of_raw(found, sensor, np.array(matrix), np.array(offset), slope, *uncertain)
+    return rewritten(rows, found)
 
 
 def _origin(s: CompositionSettings) -> dict[str, Json]:

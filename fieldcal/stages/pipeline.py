@@ -239,7 +239,7 @@ PIPELINE: tuple[Stage, ...] = (
             "motor_faults": "vectors.faults",
         },
         (),
-        ("calibration", "covariance", "trajectory", "held_out", "faults"),
+        ("calibration", "covariance", "trajectory", "held_out", "faults", "information"),
     ),
     _stage(
         "vps_sync",
@@ -301,9 +301,13 @@ PIPELINE: tuple[Stage, ...] = (
         "composition",
         composition.compose,
         CompositionSettings,
-        {"calibration": "choice.calibration", "warm_up": "warm_up.calibration"},
+        {
+            "calibration": "choice.calibration",
+            "warm_up": "warm_up.calibration",
+            "information": "joint.information",
+        },
         (),
-        ("calibration",),
+        ("calibration", "information"),
     ),
 )
 
@@ -312,6 +316,7 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
     "calibration": ("composition.calibration",),
     "fit": ("verify.fit",),
     "sync": ("vps_sync.sync",),
+    "information": ("composition.information",),
 }
 
 

@@ -149,6 +149,7 @@ FORMS = {
     "fit": (3, "1e14d746"),
     "sync": (3, "266ce3a5"),
     "run": (3, "ac506f44"),
+    "information": (1, "0f251e66"),
     "drift": (4, "e8fac4a1"),
     "decision": (1, "ba9619df"),
     "export": (1, "a1abda15"),
