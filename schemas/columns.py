@@ -244,7 +244,7 @@ RUN_KEY = Column(
     "run_key", _TEXT, "", "digest of inputs, parameters, code and versions that made the row", provenance=True
 )
 
-# --- information
+# --- information, and pooled
 PLACE = Column("place", _I64, "1", "number of the parameter among those of the flight and unit, from 0")
 SENSOR_UNIT_ID = Column(
     "sensor_unit_id", _TEXT, "", "the sensor's own unit, where the units of a flight's sensors differ; else unit_id"
@@ -266,6 +266,36 @@ INFORMATION = Column(
     "row of N up to its diagonal, by place: information on this parameter and each before it, the prior taken out, "
     "attitude, translation, dip and noise levels eliminated, coloured noise in it; all 0 where nothing is known",
 )
+POOLED_WITH = Column(
+    "pooled_with",
+    _TEXT,
+    "",
+    "unit_id in `information` of what was pooled: rows with the same share a covariance",
+)
+COVARIANCE_BEFORE = Column(
+    "covariance",
+    pa.list_(_F64),
+    "product of the units of the two parameters",
+    "of value_at_25degc with that of each parameter before it, by place, and with itself; null when refused",
+)
+WALK_PER_SQRT_DAY = Column(
+    "walk_per_sqrt_day",
+    _F64,
+    "column unit per square root of a day",
+    "how much it walks, by all its siblings",
+)
+SLOPE_SPREAD = Column("slope_spread", _F64, "column unit per degC", "scatter of slope_per_degc among siblings")
+N_INNOVATIONS = Column(
+    "n_innovations", _F64, "1", "sessions of all siblings that session_sd, walk_per_sqrt_day and slope_spread are from"
+)
+FLIGHTS_POOLED = Column("flights", pa.list_(_TEXT), "", "flight_id of each flight that was pooled, in order of time")
+SHARES = Column(
+    "shares",
+    pa.list_(_F64),
+    "1",
+    "by flights: share of what was known of the parameter then that would not have been known without the flight",
+)
+LEFT_OUT = Column("left_out", pa.list_(_TEXT), "", "flight_id of each flight that contradicts the others, left out")
 
 # --- fit
 QUANTITY = Column(
@@ -298,7 +328,7 @@ STATUS = Column(
     _TEXT,
     "",
     "outcome: ok, refused, absent, failed, or withdrawn by a decision (`drift`: stable, drifting, step, outlier, "
-    "insufficient)",
+    "insufficient; `pooled`: ok, step, refused, or insufficient where the last session contradicts the others)",
 )
 
 # --- run

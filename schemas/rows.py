@@ -197,6 +197,40 @@ class DriftRow(TypedDict):
     curve_per_degc3_sd: float | None
 
 
+class PooledRow(UnitLead):
+    """A row of `pooled`; what leads it is the last flight's."""
+
+    sensor: str
+    parameter: str
+    axis: str
+    unit: str
+    value_at_25degc: float | None
+    sd: float | None
+    slope_per_degc: float | None
+    slope_per_degc_sd: float | None
+    best_known_degc: float | None
+    temperature_min_degc: float | None
+    temperature_max_degc: float | None
+    session_sd: float | None
+    walk_per_sqrt_day: float | None
+    slope_spread: float | None
+    n_innovations: float
+    n_flights: int
+    n_sessions: int
+    change_at: datetime | None
+    change_size: float | None
+    change_size_sd: float | None
+    pooled_with: str
+    place: int
+    covariance: list[float] | None
+    flights: list[str]
+    shares: list[float]
+    left_out: list[str]
+    status: str
+    reason_code: str | None
+    reason: str | None
+
+
 class DecisionRow(TypedDict):
     """A row of `decision`. What names a part of the flight is None for all of it."""
 
@@ -246,6 +280,7 @@ ROWS = {
     "run": RunRow,
     "information": InformationRow,
     "drift": DriftRow,
+    "pooled": PooledRow,
     "decision": DecisionRow,
     "export": ExportRow,
 }

@@ -297,6 +297,46 @@ _HISTORY = (
         ("unit_id", "sensor", "method", "parameter", "axis"),
     ),
     Table(
+        "pooled",
+        "history",
+        1,
+        "one row a unit, sensor, parameter and axis: what all flights together say of it, led by the last one",
+        (
+            *c.LEAD,
+            *_UNIT,
+            c.SENSOR,
+            c.PARAMETER,
+            c.AXIS,
+            c.UNIT,
+            c.VALUE_AT_25DEGC,
+            c.SD,
+            c.SLOPE_PER_DEGC,
+            c.SLOPE_PER_DEGC_SD,
+            c.BEST_KNOWN_DEGC,
+            c.TEMPERATURE_MIN_DEGC,
+            c.TEMPERATURE_MAX_DEGC,
+            c.SESSION_SD,
+            c.WALK_PER_SQRT_DAY,
+            c.SLOPE_SPREAD,
+            c.N_INNOVATIONS,
+            c.N_FLIGHTS,
+            c.N_SESSIONS,
+            c.CHANGE_AT,
+            c.CHANGE_SIZE,
+            c.CHANGE_SIZE_SD,
+            c.POOLED_WITH,
+            c.PLACE,
+            c.COVARIANCE_BEFORE,
+            c.FLIGHTS_POOLED,
+            c.SHARES,
+            c.LEFT_OUT,
+            c.STATUS,
+            c.REASON_CODE,
+            c.REASON,
+        ),
+        ("unit_id", "sensor", "parameter", "axis"),
+    ),
+    Table(
         "decision",
         "history",
         1,
@@ -343,6 +383,8 @@ STAGE_TABLES = tuple(table.name for table in _STAGES)
 HISTORY_TABLES = tuple(table.name for table in _HISTORY)
 FLIGHT_TABLES = ("flight", "calibration", "fit", "sync", "run", "information")
 """Those of the history that nights fill, flight by flight."""
+FLEET_TABLES = ("drift", "pooled")
+"""Those that follow from these, vehicle by vehicle."""
 
 UNITS_APART = "."
 """Between a signal's name and the number of a further unit on board: "imu.1"."""

@@ -17,6 +17,7 @@ TYPES = {
     pa.int64(): int,
     pa.bool_(): bool,
     pa.list_(pa.float64()): list[float],
+    pa.list_(pa.string()): list[str],
     pa.timestamp("us", tz="UTC"): datetime,
 }
 
