@@ -18,6 +18,7 @@ from fieldcal.warehouse.questions import calibration_history, existing, those_as
 if TYPE_CHECKING:
     from fieldcal.exports.calibration import Constants, Export
     from fieldcal.exports.handed_out import HandedOut
+    from fieldcal.trends.pooled.plan import Plan
     from fieldcal.warehouse.sql import Limits, SqlValue
 
 
@@ -163,6 +164,21 @@ class Warehouse(query.Warehouse):
             Only these.
         """
         return those_asked_for(existing(self.root), "pooled", vehicle, sensor, parameter).collect()
+
+    def plan(self, vehicle: str) -> Plan:
+        """Which half a minute of motion would tell most of a vehicle's constants, and the sd to expect after it.
+
+        Its `manoeuvres`, the best first, have `words`, `expected` (constant, sd_now, sd_after, limit, unit),
+        `refused_now` and `refused_after`: how many constants are not known well enough.
+
+        Raises
+        ------
+        FieldcalError
+            `not_found`, `no_calibration`: the history has no such vehicle, or no two flights of it with information.
+        """
+        from fieldcal.trends.pooled.plan import plan
+
+        return plan(self.root, vehicle)
 
     def calibration_at(
         self, vehicle: str, temperature_degc: float | None = None, *, unit: str | None = None

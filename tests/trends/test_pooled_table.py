@@ -191,3 +191,30 @@ def test_a_withdrawn_flight_counts_no_more(fleet: tuple[Path, list[Truth]], tmp_
     assert after["n_flights"].max() == SESSIONS - 1
     warehouse.accept(f"001-{SESSIONS - 1:04d}", reason="it did not")
     assert warehouse.pooled(vehicle="v1").equals(before)
+
+
+def test_what_to_fly_next_is_what_would_show_what_no_flight_shows(
+    fleet: tuple[Path, list[Truth]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The accelerometer's x scale: of all turns about a single axis, pitch alone moves gravity along x."""
+    found = fieldcal.Warehouse(fleet[0]).plan("v2")
+    best = found.manoeuvres[0]
+    assert (best.refused_now, best.refused_after) == (1, 0)
+    assert "pitch" in best.words
+    assert "by 60° either way" in best.words
+    after = {
+        m.words.split(" by ")[0]: e.sd_after
+        for m in found.manoeuvres
+        for e in m.expected
+        if e.constant == "the accelerometer's x scale"
+    }
+    assert after["pitch"] < 0.5 < 2.0 < min(after["roll"], after["turn the heading"])  # per cent
+    (unseen,) = [e for e in best.expected if e.constant == "the accelerometer's x scale"]
+    assert unseen.sd_now == np.inf
+    assert unseen.sd_after < unseen.limit == 5.0
+    assert all(e.sd_after <= e.sd_now * (1.0 + 1e-6) for m in found.manoeuvres for e in m.expected)
+    assert run(["plan", "v2", "--warehouse", str(fleet[0])]) == 0
+    told = capsys.readouterr().out
+    assert f"v2 (v2): {best.words}." in told
+    assert "the accelerometer's x scale: not known → " in told
+    assert run(["plan", "nobody", "--warehouse", str(fleet[0])]) == 2

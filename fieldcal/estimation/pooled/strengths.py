@@ -25,7 +25,8 @@ EXPECTED_SHARE = 0.5
 RISE = 0.3
 """Of minus twice the logarithm of the likelihood that a strength is still likely at: half a standard deviation."""
 TOLERANCES = {"fatol": 0.05, "xatol": 0.1}
-STARTS = ((0.1, 0.5), (0.5, 0.1))
+START = 0.2, 0.4, 0.5
+"""Sd of walk, scatter and slope over that of a session itself, from where the likeliest are looked for."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Strengths:
     walk: float
     scatter: float
     slope: float
-    freedom: float = np.inf
+    freedom: float = 1e6
     """Innovations that they were estimated from: so uncertain is what is divided by them."""
 
 
@@ -129,13 +130,8 @@ def strengths_of(series: Series, *, with_slope: bool = True) -> Strengths:
         return float(likelihood + few + outside)
 
     size = 3 if with_slope else 2
-    best = min(
-        (
-            minimize(cost, np.log(np.square([*start, 1.0][:size])), method="Nelder-Mead", options=TOLERANCES)
-            for start in STARTS
-        ),
-        key=lambda found: found.fun,
-    )
+    simplex = np.log(np.square(START[:size])) + np.eye(size + 1, size, -1)
+    best = minimize(cost, simplex[0], method="Nelder-Mead", options={**TOLERANCES, "initial_simplex": simplex})
     most = [_largest_likely(cost, best.x, best.fun, i) for i in range(size)]
     found = given(np.array(most))
     return replace(found, freedom=FEW + float(np.isfinite(innovations(series, found)[0]).sum()))

@@ -131,7 +131,7 @@ def pool(unit: Unit, kinds: Kinds, *, tested: bool = True) -> Pooled:
     """Smooth a unit's flights; `tested`: look for steps and for flights that contradict the others, the surest first,
     until there is none."""
     names, sloped = unit.names, tuple(k for k, name in enumerate(unit.names) if name[1] in SLOPED)
-    raw = tuple(_of_state(flight, names, sloped, _usual_warmth(unit)) for flight in unit.flights)
+    raw = tuple(state_of(flight, names, sloped, _usual_warmth(unit)) for flight in unit.flights)
     strengths = [kinds[name[:2]] for name in names]
     nothing = np.zeros(len(sloped))
     scatter = np.r_[[s.scatter for s in strengths], nothing]
@@ -160,7 +160,7 @@ def _usual_warmth(unit: Unit) -> float:
     return float(np.mean(known)) if known else 0.0
 
 
-def _of_state(flight: Flight, names: tuple[Name, ...], sloped: tuple[int, ...], usual_degc: float) -> Known:
+def state_of(flight: Flight, names: tuple[Name, ...], sloped: tuple[int, ...], usual_degc: float) -> Known:
     """A flight's equations as those of the state: the constants at its temperature are constants plus slopes."""
     own = flight.equations
     warmth = usual_degc if flight.warmth_degc is None else flight.warmth_degc

@@ -143,9 +143,9 @@ def _refusal(found: Pooled, now: Estimate, place: int, name: Name, best: float, 
     """Why a constant is not known well enough, with the motion that would show it; None where it is.
 
     Judged at the temperature, of those flown, at which it is known best."""
-    limit, scale, unit = _limit(one, name)
+    limit, scale, unit = limit_of(one, name)
     if limit is None:
-        return None if np.isfinite(now.covariance[place, place]) else f"No flight shows {_words(name)}."
+        return None if np.isfinite(now.covariance[place, place]) else f"No flight shows {words_of(name)}."
     at = best if one.temperatures_degc is None else float(np.clip(best, *one.temperatures_degc))
     value, variance = now.of(found.combination(place, at - REFERENCE_DEGC))
     sd = np.sqrt(variance) / (abs(value) if name[1] == "gain" else 1.0)
@@ -153,14 +153,14 @@ def _refusal(found: Pooled, now: Estimate, place: int, name: Name, best: float, 
         return None
     motion = (TURN if name[0] == Sensor.GYROSCOPE and name[1] == "gain" else TILT).format(axis=name[2])
     told = (
-        f"{len(found.raw)} flights together do not show {_words(name)} at all."
+        f"{len(found.raw)} flights together do not show {words_of(name)} at all."
         if not np.isfinite(sd)
-        else f"The sd of {_words(name)} is {sd * scale:.2g} {unit}; the limit is {limit * scale:.2g} {unit}."
+        else f"The sd of {words_of(name)} is {sd * scale:.2g} {unit}; the limit is {limit * scale:.2g} {unit}."
     )
     return f"{told} {motion}"
 
 
-def _limit(one: HistoryUnit, name: Name) -> tuple[float | None, float, str]:
+def limit_of(one: HistoryUnit, name: Name) -> tuple[float | None, float, str]:
     """(largest sd, of a gain relative, of a zero in its calibrated unit; that in the shown unit; the shown unit)."""
     p = Parameters()
     if name[1] == "gain":
@@ -177,7 +177,8 @@ def _limit(one: HistoryUnit, name: Name) -> tuple[float | None, float, str]:
     return INFORMED_SHARE * p.prior_magnetometer_zero * field, 1.0, calibrated
 
 
-def _words(name: Name) -> str:
+def words_of(name: Name) -> str:
+    """A constant in words."""
     parameter = "scale" if name[1] == "gain" else name[1].replace("_", " ")
     return f"the {name[0]}'s {name[2]} {parameter}".replace("  ", " ")
 
