@@ -293,7 +293,7 @@ def cost(units: int, count: int) -> None:
 
 
 def real(archives: Sequence[Path], piece_s: float) -> None:
-    """Recordings cut into pieces, each a flight of its own: pooled constants against the recording's reference."""
+    """Recordings cut into pieces, each a flight and session of its own: pooled against the recording's reference."""
     from real_recordings import truth_of
 
     from fieldcal.config.configuration import load
@@ -320,7 +320,7 @@ def real(archives: Sequence[Path], piece_s: float) -> None:
                 pieces += 1
                 tables = results["composition"].tables
                 if "information" in tables and tables["information"].height:
-                    rows.append(led(tables["information"], 0, k, 0, k * 1e-4))
+                    rows.append(led(tables["information"], 0, k, k, k * 1e-3))
                 if "calibration" in tables:
                     ok = tables["calibration"].filter(parameter="scale", status="ok", method="joint")
                     alone += ok.filter(pl.col("axis").str.len_chars() == 1).height
