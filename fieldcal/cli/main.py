@@ -18,8 +18,7 @@ from fieldcal.cli.fly import apply, compare, export
 from fieldcal.cli.interrupt import interruptible
 from fieldcal.cli.look import init, inspect
 from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
-from fieldcal.cli.plan import plan
-from fieldcal.cli.pooled import pooled
+from fieldcal.cli.pooled import plan, pooled
 from fieldcal.cli.prune import prune
 from fieldcal.cli.report import report as report_command
 from fieldcal.cli.serve import serve, trigger
