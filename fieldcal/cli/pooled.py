@@ -1,5 +1,5 @@
-"""`fieldcal pooled`: what all flights of a unit know together, as the last night published it; `fieldcal plan`: which half
-a minute of motion would tell most beside it."""
+"""`fieldcal pooled`: what all flights of a unit know together, as the last night published it; `fieldcal plan`: which
+half a minute of motion would tell most beside it."""
 
 from __future__ import annotations
 
