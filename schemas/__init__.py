@@ -10,6 +10,7 @@ if __name__ != "fieldcal.schemas":  # a checkout has this folder at its root too
 from fieldcal.schemas.arrow import SchemaMismatch, arrow_schema, check, conform
 from fieldcal.schemas.column import AS_LOGGED, Column, Table
 from fieldcal.schemas.tables import (
+    FLEET_TABLES,
     FLIGHT_TABLES,
     HISTORY_TABLES,
     SIGNAL_TABLES,
@@ -23,6 +24,7 @@ from fieldcal.schemas.tables import (
 
 __all__ = [
     "AS_LOGGED",
+    "FLEET_TABLES",
     "FLIGHT_TABLES",
     "HISTORY_TABLES",
     "SIGNAL_TABLES",

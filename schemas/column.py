@@ -31,7 +31,8 @@ class Column:
 
     @property
     def numeric(self) -> bool:
-        return bool(pa.types.is_integer(self.type) or pa.types.is_floating(self.type))
+        kind = self.type.value_type if pa.types.is_list(self.type) else self.type
+        return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
 
 
 @dataclass(frozen=True)

@@ -234,7 +234,8 @@ PARAMETER = Column(
     "point, to the sensor, body axes; delay behind the gyroscope or the trajectory; dip of the field; g_sensitivity of "
     "the reading to specific force (the zero is that at the flight's mean force); field_per_current, "
     "field_per_throttle: what the motors add to the reading; residual_...: of readings that an autopilot had corrected "
-    "before it logged them, beside which the others are the raw sensor's",
+    "before it logged them, beside which the others are the raw sensor's; in `information` gain, zero: reading = gain "
+    "* z + zero, so gain is 1/scale, and cross: an off-diagonal element of the matrix over its row's diagonal one",
 )
 AXIS = Column("axis", _TEXT, "", "sensor axis x, y or z; full form xx, xy, ...")
 VALUE = Column("value", _F64, "named by column unit", "estimate of the parameter; null when refused without a number")
@@ -264,6 +265,58 @@ SUMS = Column(
     "JSON object: polarity (3), centre taken off the readings (3), noise: sums of squared third differences (3), and "
     "sums, of products of the readings to the fourth order (34) or of the gyroscope's equations (33)",
 )
+# --- information, and pooled
+PLACE = Column("place", _I64, "1", "number of the parameter among those of the flight and unit, from 0")
+SENSOR_UNIT_ID = Column(
+    "sensor_unit_id", _TEXT, "", "the sensor's own unit, where the units of a flight's sensors differ; else unit_id"
+)
+LINEARISED_AT = Column(
+    "linearised_at",
+    _F64,
+    "named by column unit",
+    "value p0 about which the flight's equations N (p - p0) = g are linear: the flight's joint estimate, or what the "
+    "parameter was held at; readings are centred there, so that a few per cent of a scale change N by as much",
+)
+RIGHT_SIDE = Column(
+    "right_side", _F64, "1 over column unit", "element of g: 0 where the flight alone, without its prior, is at p0"
+)
+INFORMATION = Column(
+    "information",
+    pa.list_(_F64),
+    "1 over the units of the two parameters",
+    "row of N up to its diagonal, by place: information on this parameter and each before it, the prior taken out, "
+    "attitude, translation, dip and noise levels eliminated, coloured noise in it; all 0 where nothing is known",
+)
+POOLED_WITH = Column(
+    "pooled_with",
+    _TEXT,
+    "",
+    "unit_id in `information` of what was pooled: rows with the same share a covariance",
+)
+COVARIANCE_BEFORE = Column(
+    "covariance",
+    pa.list_(_F64),
+    "product of the units of the two parameters",
+    "of value_at_25degc with that of each parameter before it, by place, and with itself; null when refused",
+)
+WALK_PER_SQRT_DAY = Column(
+    "walk_per_sqrt_day",
+    _F64,
+    "column unit per square root of a day",
+    "how much it walks, by all its siblings",
+)
+SLOPE_SPREAD = Column("slope_spread", _F64, "column unit per degC", "scatter of slope_per_degc among siblings")
+N_INNOVATIONS = Column(
+    "n_innovations", _F64, "1", "sessions of all siblings that session_sd, walk_per_sqrt_day and slope_spread are from"
+)
+FLIGHTS_POOLED = Column("flights", pa.list_(_TEXT), "", "flight_id of each flight that was pooled, in order of time")
+SHARES = Column(
+    "shares",
+    pa.list_(_F64),
+    "1",
+    "by flights: share of what was known of the parameter then that would not have been known without the flight",
+)
+LEFT_OUT = Column("left_out", pa.list_(_TEXT), "", "flight_id of each flight that contradicts the others, left out")
 
 # --- fit
 QUANTITY = Column(
@@ -296,7 +349,7 @@ STATUS = Column(
     _TEXT,
     "",
     "outcome: ok, refused, absent, failed, or withdrawn by a decision (`drift`: stable, drifting, step, outlier, "
-    "insufficient)",
+    "insufficient; `pooled`: ok, step, refused, or insufficient where the last session contradicts the others)",
 )
 
 # --- run

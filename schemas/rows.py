@@ -156,6 +156,24 @@ class UnfoldedRun(_StageRun):
     versions: Mapping[str, str] | None
 
 
+class InformationRow(UnitLead):
+    """A row of `information`."""
+
+    place: int
+    sensor: str
+    parameter: str
+    axis: str
+    sensor_unit_id: str
+    unit: str
+    linearised_at: float
+    right_side: float
+    information: list[float]
+    temperature_degc: float | None
+    status: str
+    reason_code: str | None
+    run_key: str | None
+
+
 class DriftRow(TypedDict):
     """A row of `drift`."""
 
@@ -193,6 +211,40 @@ class DriftRow(TypedDict):
     curve_per_degc2_sd: float | None
     curve_per_degc3: float | None
     curve_per_degc3_sd: float | None
+
+
+class PooledRow(UnitLead):
+    """A row of `pooled`; what leads it is the last flight's."""
+
+    sensor: str
+    parameter: str
+    axis: str
+    unit: str
+    value_at_25degc: float | None
+    sd: float | None
+    slope_per_degc: float | None
+    slope_per_degc_sd: float | None
+    best_known_degc: float | None
+    temperature_min_degc: float | None
+    temperature_max_degc: float | None
+    session_sd: float | None
+    walk_per_sqrt_day: float | None
+    slope_spread: float | None
+    n_innovations: float
+    n_flights: int
+    n_sessions: int
+    change_at: datetime | None
+    change_size: float | None
+    change_size_sd: float | None
+    pooled_with: str
+    place: int
+    covariance: list[float] | None
+    flights: list[str]
+    shares: list[float]
+    left_out: list[str]
+    status: str
+    reason_code: str | None
+    reason: str | None
 
 
 class DecisionRow(TypedDict):
@@ -243,7 +295,9 @@ ROWS = {
     "sync": SyncRow,
     "moments": MomentsRow,
     "run": RunRow,
+    "information": InformationRow,
     "drift": DriftRow,
+    "pooled": PooledRow,
     "decision": DecisionRow,
     "export": ExportRow,
 }

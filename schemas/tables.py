@@ -252,6 +252,30 @@ _HISTORY = (
         ("flight_id", "unit_id", "stage"),
     ),
     Table(
+        "information",
+        "history",
+        1,
+        "one row a unit and parameter of a flight: its normal equations, what it says of all constants together",
+        (
+            *c.LEAD,
+            *_UNIT,
+            c.PLACE,
+            c.SENSOR,
+            c.PARAMETER,
+            c.AXIS,
+            c.SENSOR_UNIT_ID,
+            c.UNIT,
+            c.LINEARISED_AT,
+            c.RIGHT_SIDE,
+            c.INFORMATION,
+            c.TEMPERATURE_DEGC,
+            c.STATUS,
+            c.REASON_CODE,
+            c.RUN_KEY,
+        ),
+        ("flight_id", "unit_id", "place"),
+    ),
+    Table(
         "drift",
         "history",
         4,
@@ -293,6 +317,46 @@ _HISTORY = (
             c.CURVE_PER_DEGC3_SD,
         ),
         ("unit_id", "sensor", "method", "parameter", "axis"),
+    ),
+    Table(
+        "pooled",
+        "history",
+        1,
+        "one row a unit, sensor, parameter and axis: what all flights together say of it, led by the last one",
+        (
+            *c.LEAD,
+            *_UNIT,
+            c.SENSOR,
+            c.PARAMETER,
+            c.AXIS,
+            c.UNIT,
+            c.VALUE_AT_25DEGC,
+            c.SD,
+            c.SLOPE_PER_DEGC,
+            c.SLOPE_PER_DEGC_SD,
+            c.BEST_KNOWN_DEGC,
+            c.TEMPERATURE_MIN_DEGC,
+            c.TEMPERATURE_MAX_DEGC,
+            c.SESSION_SD,
+            c.WALK_PER_SQRT_DAY,
+            c.SLOPE_SPREAD,
+            c.N_INNOVATIONS,
+            c.N_FLIGHTS,
+            c.N_SESSIONS,
+            c.CHANGE_AT,
+            c.CHANGE_SIZE,
+            c.CHANGE_SIZE_SD,
+            c.POOLED_WITH,
+            c.PLACE,
+            c.COVARIANCE_BEFORE,
+            c.FLIGHTS_POOLED,
+            c.SHARES,
+            c.LEFT_OUT,
+            c.STATUS,
+            c.REASON_CODE,
+            c.REASON,
+        ),
+        ("unit_id", "sensor", "parameter", "axis"),
     ),
     Table(
         "decision",
@@ -339,14 +403,16 @@ TABLES: dict[str, Table] = {table.name: table for table in (*_SIGNALS, *_STAGES,
 SIGNAL_TABLES = tuple(table.name for table in _SIGNALS)
 STAGE_TABLES = tuple(table.name for table in _STAGES)
 HISTORY_TABLES = tuple(table.name for table in _HISTORY)
-FLIGHT_TABLES = ("flight", "calibration", "fit", "sync", "moments", "run")
+FLIGHT_TABLES = ("flight", "calibration", "fit", "sync", "moments", "run", "information")
 """Those of the history that nights fill, flight by flight."""
+FLEET_TABLES = ("drift", "pooled")
+"""Those that follow from these, vehicle by vehicle."""
 
 UNITS_APART = "."
 """Between a signal's name and the number of a further unit on board: "imu.1"."""
 
-_NOT_AT_STAGE_LEVEL = frozenset(column.name for column in (*c.LEAD, *_UNIT, c.RUN_KEY))
-_AT_STAGE_LEVEL = ("calibration", "fit", "sync", "moments")
+_NOT_AT_STAGE_LEVEL = frozenset(column.name for column in (*c.LEAD, *_UNIT, c.SENSOR_UNIT_ID, c.RUN_KEY))
+_AT_STAGE_LEVEL = ("calibration", "fit", "sync", "moments", "information")
 
 
 def table_columns(table: str, *, stage: bool = False) -> tuple[Column, ...]:

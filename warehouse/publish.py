@@ -15,7 +15,7 @@ import polars as pl
 
 from fieldcal import schemas
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.schemas import FLIGHT_TABLES, HISTORY_TABLES, SchemaMismatch
+from fieldcal.schemas import FLEET_TABLES, FLIGHT_TABLES, HISTORY_TABLES, SchemaMismatch
 from fieldcal.schemas.columns import SEQUENCE, STARTED_AT
 from fieldcal.warehouse import checksums
 from fieldcal.warehouse.decisions.withdrawn import DECIDED, as_decided, decisions
@@ -25,7 +25,7 @@ from fieldcal.warehouse.layout import history_path
 from fieldcal.warehouse.lock import vehicle_lock
 from fieldcal.warehouse.store import conform, empty_frame, frame, read_arrow, read_table, table_bytes
 
-_ORDER = (*(name for name in FLIGHT_TABLES if name != "flight"), "drift", "flight")
+_ORDER = (*(name for name in FLIGHT_TABLES if name != "flight"), *FLEET_TABLES, "flight")
 
 
 def publish(
@@ -38,8 +38,9 @@ def publish(
 ) -> tuple[str, ...]:
     """Replace all rows of `flights` in the vehicle's history by `rows`; rows of other flights stay.
 
-    A table that is not in `rows` loses its rows of these flights too. `drift` has no flights: when given, it replaces
-    the vehicle's. `flight` is written last: a flight that it lists as just published is so in every other table.
+    A table that is not in `rows` loses its rows of these flights too. `drift` and `pooled` have no flights: when given,
+    each replaces the vehicle's. `flight` is written last: a flight that it lists as just published is so in every other
+    table.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ def publish(
     with vehicle_lock(root, vehicle_id, timeout_s):
         for table in _ORDER:
             new = prepared.get(table)
-            if (table == "drift" and new is None) or (new is None and not flights):
+            if (table in FLEET_TABLES and new is None) or (new is None and not flights):
                 continue
             if _replace(root, table, vehicle_id, empty_frame(table) if new is None else new, flights):
                 changed.append(table)
@@ -112,7 +113,7 @@ def _only(table: str, what: str, found: pl.Series, allowed: Collection[str]) -> 
 def _replace(root: Path, table: str, vehicle_id: str, new: pl.DataFrame, flights: Collection[str]) -> bool:
     path = history_path(root, table, vehicle_id)
     before, there = _existing(root, path, table)
-    kept = there.clear() if table == "drift" else there
+    kept = there.clear() if table in FLEET_TABLES else there
     if table in FLIGHT_TABLES and flights:
         kept = there.filter(~pl.col("flight_id").is_in(list(flights)))
     if before is None and not new.height:

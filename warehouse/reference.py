@@ -35,6 +35,10 @@ EXAMPLES = {
     "run": "SELECT stage, reason_code, count(*) AS flights FROM run WHERE status = 'refused' GROUP BY ALL ORDER BY 3",
     "drift": "SELECT vehicle_id, sensor, parameter, axis, status, reason FROM drift"
     " WHERE status NOT IN ('stable', 'insufficient')",
+    "moments": "SELECT vehicle_id, sensor, sum(n_samples) AS samples FROM moments GROUP BY ALL",
+    "information": "SELECT sensor, parameter, axis, 1 / sqrt(information[place + 1]) AS least_sd FROM information"
+    " WHERE flight_id = (SELECT max(flight_id) FROM information) AND information[place + 1] > 0",
+    "pooled": "SELECT sensor, parameter, axis, value_at_25degc, sd, status FROM pooled WHERE vehicle_id = 'sim-1'",
     "decision": "SELECT decided_at, author, decision, flight_id, reason FROM decision ORDER BY decided_at",
     "export": "SELECT exported_at, vehicle_id, sensor, name, set_to FROM export ORDER BY exported_at DESC",
     "latest_calibration": "SELECT sensor, parameter, axis, value_at_25degc, sd, why FROM latest_calibration"

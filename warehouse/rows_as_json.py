@@ -38,6 +38,10 @@ def column_bytes(column: pl.Series) -> Iterator[bytes | memoryview]:
     """Nulls and values of a column as bytes, the same on every machine."""
     whole = column.null_count() == 0
     yield np.zeros(len(column), dtype=bool).data if whole else column.is_null().to_numpy().tobytes()
+    if column.dtype == pl.List:
+        yield np.ascontiguousarray(column.list.len().fill_null(0).to_numpy(), dtype="<i8").data
+        yield from column_bytes(column.drop_nulls().explode())
+        return
     if column.dtype == pl.String:
         texts = [text.encode() for text in (column if whole else column.fill_null(""))]
         yield np.array([len(text) for text in texts], dtype="<i8").tobytes()

@@ -14,12 +14,13 @@ import polars as pl
 from fieldcal.names import Decision
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.warehouse import query
-from fieldcal.warehouse.questions import calibration_history, existing
+from fieldcal.warehouse.questions import calibration_history, existing, those_asked_for
 
 if TYPE_CHECKING:
     from fieldcal.exports.calibration import Constants, Export
     from fieldcal.exports.handed_out import HandedOut
     from fieldcal.exports.refit import Refit
+    from fieldcal.trends.pooled.plan import Plan
     from fieldcal.warehouse.sql import Limits, SqlValue
 
 
@@ -95,9 +96,9 @@ class Warehouse(query.Warehouse):
         Parameters
         ----------
         query : str
-            One SELECT in DuckDB's dialect. Tables: flight, calibration, fit, sync, moments, run, drift, decision,
-            export; views: latest_calibration, history, drift_by_temperature, worst_tic, refusals, active,
-            calibration_at(°C).
+            One SELECT in DuckDB's dialect. Tables: flight, calibration, fit, sync, moments, run, information, drift,
+            pooled, decision, export; views: latest_calibration, history, drift_by_temperature, worst_tic, refusals,
+            active, calibration_at(°C).
         parameters : sequence, optional
             Fill its ``?`` marks.
         **limits
@@ -150,6 +151,36 @@ class Warehouse(query.Warehouse):
         from fieldcal.trends.drift_table import drift_rows
 
         return drift_rows(self.root, vehicle, sensor, parameter)
+
+    def pooled(
+        self, *, vehicle: str | None = None, sensor: str | None = None, parameter: str | None = None
+    ) -> pl.DataFrame:
+        """What all flights of a unit know together, as the last night published it (table `pooled`).
+
+        Flights that show a few directions of the constants alone, and whose rows are refused, count with what they
+        know. A constant that no flight shows is refused, with the motion that would.
+
+        Parameters
+        ----------
+        vehicle, sensor, parameter : str, optional
+            Only these.
+        """
+        return those_asked_for(existing(self.root), "pooled", vehicle, sensor, parameter).collect()
+
+    def plan(self, vehicle: str) -> Plan:
+        """Which half a minute of motion would tell most of a vehicle's constants, and the sd to expect after it.
+
+        Its `manoeuvres`, the best first, have `words`, `expected` (constant, sd_now, sd_after, limit, unit),
+        `refused_now` and `refused_after`: how many constants are not known well enough.
+
+        Raises
+        ------
+        FieldcalError
+            `not_found`, `no_calibration`: the history has no such vehicle, or no two flights of it with information.
+        """
+        from fieldcal.trends.pooled.plan import plan
+
+        return plan(self.root, vehicle)
 
     def calibration_at(
         self, vehicle: str, temperature_degc: float | None = None, *, unit: str | None = None
@@ -287,6 +318,7 @@ class Warehouse(query.Warehouse):
 
     def _decide(self, decision: Decision, target: str, reason: str, author: str | None, part: Part) -> Decided:
         from fieldcal.trends.drift_table import update_drift
+        from fieldcal.trends.pooled.table import update_pooled
         from fieldcal.warehouse.decisions.decide import decide, flights_meant
         from fieldcal.warehouse.lock import fleet_lock
 
@@ -295,7 +327,7 @@ class Warehouse(query.Warehouse):
         flights = flights_meant(self.root, target, part.get("session"))
         n = decide(self.root, flights, decision, reason=reason, author=author or this_user(), part=named)
         with fleet_lock(self.root):
-            trends = update_drift(self.root)
+            trends = tuple(sorted({*update_drift(self.root), *update_pooled(self.root)}))
         return Decided(decision, tuple(flights["flight_id"].to_list()), n, trends)
 
 

@@ -11,7 +11,7 @@ from fieldcal.batch.sources import TRENDS, sources
 from fieldcal.config.configuration import Alerts
 from fieldcal.names import Json
 from fieldcal.provenance.run_key import run_key
-from fieldcal.schemas import FLIGHT_TABLES, HISTORY_TABLES, TABLES
+from fieldcal.schemas import FLEET_TABLES, FLIGHT_TABLES, HISTORY_TABLES, TABLES
 from fieldcal.schemas.arrow import VERSION_KEY
 from fieldcal.trends.changes import Change, changes, last_usable
 from fieldcal.warehouse import Warehouse
@@ -61,17 +61,19 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
             settle(root, vehicle_id)  # where deciding was interrupted, rows do not follow yet
         former = Warehouse(root).scan("drift").collect()
         made_from = _made_from(root)
-        if before.get("made_from") != made_from or before.get("made") != history_digest(root, ["drift"]):
+        if before.get("made_from") != made_from or before.get("made") != history_digest(root, FLEET_TABLES):
             from fieldcal.trends.drift_table import update_drift
+            from fieldcal.trends.pooled.table import update_pooled
 
             update_drift(root)
+            update_pooled(root)
         table = Warehouse(root).scan("drift").collect()
         # With other limits than last time, what they make old is told whenever it passed them.
         limits: dict[str, Json] = {"expires_days": alerts.expires_days, "idle_days": alerts.idle_days}
         at = before.get("at")
         since = datetime.fromisoformat(at) if isinstance(at, str) and before.get("alerts") == limits else None
         told = changes(former, table, last_usable(root), now=now, since=since, alerts=alerts)
-        made = history_digest(root, ["drift"])
+        made = history_digest(root, FLEET_TABLES)
         record = {"at": now.isoformat(), "made_from": made_from, "made": made, "alerts": limits}
         write_bytes(_place(root), seal(record), durable=False)
         return Closing(told, _reports(root, told))
@@ -95,12 +97,12 @@ def _forget_damaged(root: Path) -> None:
 def _forget_older_versions(root: Path) -> None:
     """Remove trends that an older release wrote in another form: they follow from the history and are made anew. Those
     of a newer one stay, and whoever reads them says so."""
-    for path in history_files(root, "drift"):
+    for table, path in [(name, path) for name in FLEET_TABLES for path in history_files(root, name)]:
         try:
             version = int(read_facts(path).get(VERSION_KEY, "0"))
         except (OSError, ValueError):
             continue  # damaged, which publishing tells
-        if version < TABLES["drift"].version:
+        if version < TABLES[table].version:
             with disk(path, "removed"):
                 path.unlink()
 

@@ -24,10 +24,11 @@ def sources() -> Mapping[str, str]:
     """Digest by step, and of the `TRENDS`, taken once in a process: what runs is what was imported."""
     if not _known:
         from fieldcal.trends.drift_table import update_drift
+        from fieldcal.trends.pooled.table import update_pooled
 
         _known.update({stage.name: stage_source(stage) for stage in PIPELINE})
         _known[INGEST] = source_digest(ingest.tidy_log, ingest.logged_units, ingest.rejected)
-        _known[TRENDS] = source_digest(update_drift)
+        _known[TRENDS] = source_digest(update_drift, update_pooled)
     return _known
 
 

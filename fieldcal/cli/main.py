@@ -19,6 +19,7 @@ from fieldcal.cli.interrupt import interruptible
 from fieldcal.cli.look import init, inspect
 from fieldcal.cli.onboard import onboard, refit
 from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
+from fieldcal.cli.pooled import plan, pooled
 from fieldcal.cli.report import report as report_command
 from fieldcal.cli.serve import alerts_app, serve, trigger
 from fieldcal.cli.simulate import simulate
@@ -425,6 +426,8 @@ app.command(schemas)
 app.command(export_warehouse)
 app.command(simulate)
 app.command(drift)
+app.command(pooled)
+app.command(plan)
 app.command(export)
 app.command(compare)
 app.command(withdraw)

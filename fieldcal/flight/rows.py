@@ -147,7 +147,7 @@ def refusals(records: Mapping[str, StepRecord]) -> list[Refusal]:
 
 
 def published_tables(units: Sequence[tuple[FlightLead, Unit, StageTables]]) -> dict[str, pl.DataFrame]:
-    """`calibration`, `fit` and `sync` of units of flights, each its flight's `lead` and its stages' tables."""
+    """Published tables but `flight` and `run` of units of flights, each its flight's `lead` and its stages' tables."""
     result = {}
     for table, sources in PUBLISHED.items():
         parts = [
@@ -171,11 +171,14 @@ def published_tables(units: Sequence[tuple[FlightLead, Unit, StageTables]]) -> d
 def publishes(table: str, unit: Unit) -> bool:
     """Whether a unit has rows in a table: how attitudes agree, and what the VPS's clock is against the IMU's, tells of
     IMUs; a further magnetometer has constants only."""
-    return table in BY_SENSOR or Sensor.GYROSCOPE in unit.ids
+    return table in (*BY_SENSOR, "information") or Sensor.GYROSCOPE in unit.ids
 
 
 def _by_unit_id(table: str, unit: Unit, frame: pl.DataFrame) -> list[tuple[str, pl.DataFrame]]:
-    """(unit_id, rows) of what a stage found of a unit: of its sensors each by its own id."""
+    """(unit_id, rows) of what a stage found of a unit: of its sensors each by its own id, information of all."""
+    if table == "information":
+        own_ids = {str(sensor): unit_id for sensor, unit_id in unit.ids.items()}
+        return [(unit.unit_id, frame.with_columns(sensor_unit_id=pl.col("sensor").replace_strict(own_ids)))]
     if table not in BY_SENSOR:
         return [(unit.unit_id, frame)]
     sensors = {unit_id: [s for s in unit.ids if unit.ids[s] == unit_id] for unit_id in unit.ids.values()}

@@ -14,6 +14,7 @@ from fieldcal.geometry.sensor_model import through
 from fieldcal.names import RESIDUAL, SENSORS, Json, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables
+from fieldcal.stages.joint.information import equations_of, kept, of_raw, rewritten
 from fieldcal.stages.results import ZERO_SLOPE, StageResult
 from fieldcal.stages.tables import AXES, CalibrationRow, calibration_rows
 
@@ -24,7 +25,7 @@ COMPOSED = ("scale", "bias", "zero", "zero_bias")
 ORIGIN = "origin"
 """Among what the stage measured: where its readings come from."""
 PUBLISHED_ROWS = "published_rows"
-"""And how many constants were not refused."""
+"""And how many constants were not refused, or are told something of in table `information`."""
 SQUARE = 1e-9
 """Off-diagonal share of a matrix that is rounding."""
 
@@ -61,12 +62,38 @@ def compose(tables: Tables, s: CompositionSettings) -> StageResult:
             out.append(residual.with_columns(parameter=pl.lit(RESIDUAL) + pl.col("parameter")))
     rows = pl.concat(out)
     published = rows.filter((pl.col("status") == Status.OK) & pl.col("value").is_not_null()).height
+    made = {"calibration": rows}
+    if "information" in tables:
+        made["information"] = _information(tables["information"], s)
+        published += made["information"].height
     measured: dict[str, Json] = {
         ORIGIN: _origin(s),
         PUBLISHED_ROWS: published,
         **({"composed": composed} if composed else {}),
     }
-    return StageResult({"calibration": rows}, measured=measured)
+    return StageResult(made, measured=measured)
+
+
+def _information(rows: pl.DataFrame, s: CompositionSettings) -> pl.DataFrame:
+    """The same of what the flight says of all constants together; nothing of a sensor whose correction is not known."""
+    own = [
+        name
+        for name in s.own_sensors
+        if s.applied_matrix[name] is None or s.applied_offset[name] is None or s.applied_known[name]
+    ]
+    names = rows.filter(pl.col("sensor").is_in(own)).select("sensor", "parameter", "axis")
+    rows = kept(rows, set(names.iter_rows()))
+    if rows.is_empty():
+        return rows
+    found = equations_of(rows)
+    for sensor in own:
+        matrix, offset = s.applied_matrix[sensor], s.applied_offset[sensor]
+        if matrix is None or offset is None or (str(sensor), "zero", "x") not in found.names:
+            continue
+        slope, offset_sd = (np.array(x[sensor] or (0.0,) * 3) for x in (s.applied_offset_per_degc, s.applied_offset_sd))
+        uncertain = s.applied_matrix_sd[sensor] or 0.0, offset_sd
+        found = of_raw(found, sensor, np.array(matrix), np.array(offset), slope, *uncertain)
+    return rewritten(rows, found)
 
 
 def _origin(s: CompositionSettings) -> dict[str, Json]:

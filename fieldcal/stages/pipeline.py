@@ -255,7 +255,7 @@ PIPELINE: tuple[Stage, ...] = (
             "motor_faults": "vectors.faults",
         },
         (),
-        ("calibration", "covariance", "trajectory", "held_out", "faults"),
+        ("calibration", "covariance", "trajectory", "held_out", "faults", "information"),
     ),
     _stage(
         "vps_sync",
@@ -317,9 +317,13 @@ PIPELINE: tuple[Stage, ...] = (
         "composition",
         composition.compose,
         CompositionSettings,
-        {"calibration": "choice.calibration", "warm_up": "warm_up.calibration"},
+        {
+            "calibration": "choice.calibration",
+            "warm_up": "warm_up.calibration",
+            "information": "joint.information",
+        },
         (),
-        ("calibration",),
+        ("calibration", "information"),
     ),
 )
 
@@ -329,6 +333,7 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
     "fit": ("verify.fit",),
     "sync": ("vps_sync.sync",),
     "moments": ("moments.moments",),
+    "information": ("composition.information",),
 }
 
 

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pytest
 from older_history import age
@@ -27,12 +28,15 @@ from fieldcal.batch.steps import STEPS
 from fieldcal.cli.main import run
 from fieldcal.flows.run import dry_run, run_night
 from fieldcal.flows.runners import Answers
+from fieldcal.schemas import FLIGHT_TABLES
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import SCALE, Experiment
+from fieldcal.stages.joint.information import equations_of
 from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.content import content_sha256
 from fieldcal.warehouse.layout import history_files
+from fieldcal.warehouse.store import table_bytes
 from fieldcal.warehouse.upkeep.verify import verify
 
 REPOSITORY = Path(__file__).parents[2]
@@ -99,8 +103,7 @@ def test_a_night_fills_every_table(first_night: tuple[Path, Any]) -> None:
     assert (result["ok"], len(result["logs"])) == (2, 2)
     assert (result["stages_run"], result["stages_cached"]) == (2 * len(STEPS), 0)
     warehouse = Warehouse(root)
-    tables = ("flight", "calibration", "fit", "sync", "moments", "run")
-    rows = {table: warehouse.scan(table).collect() for table in tables}
+    rows = {table: warehouse.scan(table).collect() for table in FLIGHT_TABLES}
     assert all(frame["flight_id"].n_unique() == 2 for frame in rows.values())
     assert set(rows["run"]["stage"]) == set(STEPS)
     assert set(rows["calibration"]["sensor"]) == {"magnetometer", "accelerometer", "gyroscope"}
@@ -124,6 +127,33 @@ def test_a_night_leaves_moments_that_refit_solves(first_night: tuple[Path, Any],
             row = found[sensor, "scale", axis]
             assert row["method"] == "moments"
             assert abs(row["value"] / value - 1.0) < max(4.0 * row["sd"] / abs(row["value"]), 0.03)
+
+
+def test_what_each_flight_knows_of_all_constants_is_in_the_history(first_night: tuple[Path, Any]) -> None:
+    """As a list for each parameter, in SQL too; with it the flight's rows follow: no prior was known of counts."""
+    warehouse = Warehouse(first_night[0])
+    rows = warehouse.sql("FROM information ORDER BY flight_id, place")
+    calibration = warehouse.scan("calibration").filter(method="joint").collect()
+    for (flight_id,), own in rows.group_by("flight_id"):
+        found = equations_of(own)
+        sd = np.sqrt(np.diagonal(np.linalg.inv(found.information)))
+        for (sensor, parameter, axis), value, error in zip(found.names, found.reference, sd, strict=True):
+            if parameter not in ("gain", "zero"):
+                continue
+            name = "scale" if parameter == "gain" else "zero"
+            row = calibration.filter(flight_id=flight_id, sensor=sensor, parameter=name, axis=axis).row(0, named=True)
+            expected = 1.0 / row["value"] if parameter == "gain" else row["value"]
+            expected_sd = row["sd"] / row["value"] ** 2 if parameter == "gain" else row["sd"]
+            assert value == pytest.approx(expected, rel=1e-9)
+            assert 0.7 < error / expected_sd < 1.4, (sensor, parameter, axis)
+    largest = warehouse.sql(
+        "SELECT sensor, max(1 / sqrt(information[place + 1]) / abs(linearised_at)) AS least_sd FROM information "
+        "WHERE parameter = 'gain' AND status = 'ok' GROUP BY sensor"
+    )
+    assert (largest["least_sd"] < 0.02).all()
+    several = pl.concat([rows.with_columns(flight_id=pl.lit(f"{k}") + pl.col("flight_id")) for k in range(4)])
+    one_more = len(table_bytes(several, "information")) - len(table_bytes(several.head(-rows.height), "information"))
+    assert one_more < 2 * 4096, "bytes of two flights"
 
 
 def test_an_unchanged_night_runs_nothing_and_changes_no_byte(simulated: Path, warehouse: Path) -> None:

@@ -150,7 +150,9 @@ FORMS = {
     "sync": (3, "266ce3a5"),
     "moments": (1, "4079ca46"),
     "run": (3, "ac506f44"),
+    "information": (1, "0f251e66"),
     "drift": (4, "e8fac4a1"),
+    "pooled": (1, "02e3c101"),
     "decision": (1, "ba9619df"),
     "export": (1, "a1abda15"),
 }

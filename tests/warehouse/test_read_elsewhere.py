@@ -54,10 +54,11 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def keyed(table: str, first: dict[str, Any]) -> dict[str, Any]:
-    """A row that has a text in every text column, also of the key."""
+    """A row that has something in every column of a key."""
     texts = {c.name: "x" for c in schemas.table_columns(table) if c.type == pa.string()}
     stamps = {c.name: START for c in schemas.table_columns(table) if pa.types.is_timestamp(c.type)}
-    return {**texts, **stamps, **first}
+    numbers = {c.name: 0 for c in schemas.table_columns(table) if pa.types.is_integer(c.type)}
+    return {**texts, **stamps, **numbers, **first}
 
 
 @pytest.mark.parametrize("reader", READERS)

@@ -12,7 +12,7 @@ from fieldcal.warehouse import checksums
 from fieldcal.warehouse.layout import history_files
 from fieldcal.warehouse.store import empty_frame, read_table
 
-DECIDED = ("calibration", "sync")
+DECIDED = ("calibration", "sync", "information")
 """Tables of flights whose rows have a status that says whether they count."""
 PARTS = ("unit_id", "sensor", "parameter", "axis")
 """Columns by which a decision may mean a part of a flight."""
@@ -40,12 +40,15 @@ def counting(root: Path) -> pl.Expr:
 
 def as_decided(table: str, rows: pl.DataFrame, decided: pl.DataFrame) -> pl.DataFrame:
     """Rows of a table among `DECIDED` with the status that the last decision about each gives it: `ok` becomes
-    `withdrawn` and `withdrawn` `ok`; what was refused stays so. A VPS's clock goes with its flight or unit."""
+    `withdrawn` and `withdrawn` `ok`; what was refused stays so. A VPS's clock goes with its flight or unit, information
+    on a gain with its scale."""
     of_flights = decided.filter(pl.col("flight_id").is_in(rows["flight_id"].unique().to_list()))
     if of_flights.is_empty():
         return rows
     state = rows["status"].to_numpy().astype(object)
     columns = {name: rows[name].to_numpy() for name in ("flight_id", *PARTS) if name in rows.columns}
+    if table == "information":
+        columns["parameter"] = np.where(columns["parameter"] == "gain", "scale", columns["parameter"])
     counts = np.full(rows.height, None, dtype=object)
     for decision in of_flights.iter_rows(named=True):
         meant = columns["flight_id"] == decision["flight_id"]

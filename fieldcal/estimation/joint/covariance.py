@@ -57,22 +57,48 @@ def sums_of_rows(
     return RowSums(sensitivity, residual, count, score)
 
 
-def covariance(
+@dataclass(frozen=True)
+class Noise:
+    """What the residuals show of the noise beyond the model's: `excess` (p, p) of the scores' covariance over the
+    information, by correlation over longer times than an interval; `score` (K, p) by interval, at times `elapsed_s`
+    (K,)."""
+
+    excess: Array
+    score: Array
+    elapsed_s: Array
+
+    def enlargement(self, combination: Array, variance: Array) -> Array:
+        """Factors (r,), at least 1, on the sd of linear estimates.
+
+        Correlation of the noise within an interval is in the whitening already. Correlation over longer times (a field
+        that varies from place to place, a temperature) is measured on means by interval: M = ΣΣ S̄ᵀ𝓡S̄ instead of
+        ΣS̄ᵀS̄ for each residual of the rows, S̄ the sensitivity with the knots eliminated. Noise unlike the model's
+        (strong for some seconds and weak for others, a translation that swings at one frequency) is measured by the
+        scores S̄ᵀr of blocks of time, all residuals together (`variance_by_blocks`). Neither ever makes a standard
+        deviation smaller.
+
+        Parameters
+        ----------
+        combination : (p, r) array
+            The estimates' errors are combinationᵀ times the sum of the scores: the inverse information gives those of
+            the parameters.
+        variance : (r,) array
+            Theirs if the noise were as the model has it.
+        """
+        coloured = variance + np.einsum("pr,pq,qr->r", combination, self.excess, combination)
+        by_blocks = variance_by_blocks(self.score @ combination, self.elapsed_s)
+        return np.asarray(np.sqrt(np.maximum(1.0, np.maximum(coloured, by_blocks) / variance)))
+
+
+def noise_of(
     model: Model,
     rows: RowSums,
     response: Array,
-    information: Array,
     jumps: tuple[Array, Array],
     process: tuple[Array, Array],
     others: tuple[Array, Array] | None = None,
-) -> Array:
-    """Covariance (p, p) of θ: the inverse information, enlarged where the residuals show that it is too small.
-
-    Correlation of the noise within an interval is in the whitening already. Correlation over longer times (a field that
-    varies from place to place, a temperature) is measured on means by interval: M = ΣΣ S̄ᵀ𝓡S̄ instead of ΣS̄ᵀS̄ for
-    each residual of the rows, S̄ the sensitivity with the knots eliminated. Noise unlike the model's (strong for some
-    seconds and weak for others, a translation that swings at one frequency) is measured by the scores S̄ᵀr of blocks of
-    time, all residuals together (`variance_by_blocks`). Neither ever makes a standard deviation smaller.
+) -> Noise:
+    """Of all residuals together.
 
     Parameters
     ----------
@@ -80,8 +106,6 @@ def covariance(
         At the solution.
     response : (K, s, p) array
         Knots' response N_xx⁻¹N_xθ to the parameters.
-    information : (p, p) array
-        Of θ, knots eliminated.
     jumps : (K−1, 3), (K−1,) arrays
         Attitude jumps at the joints, and 1/their sd: coloured where the gyroscope's bias drifts.
     process : (K, c, p), (K, c) arrays
@@ -90,8 +114,7 @@ def covariance(
     others : (K, c, p), (K, c) arrays, optional
         The same of other measurements at the knots (VPS poses).
     """
-    inverse = inverse_information(information)
-    r, p = rows.residual.shape[1] - 3, len(information)
+    r, p = rows.residual.shape[1] - 3, response.shape[2]
     sensitivity, residual, score = rows.sensitivity.copy(), rows.residual.copy(), rows.score.copy()
     residual[:-1, r:] += jumps[0] * jumps[1][:, None]
     sensitivity[:-1, r:] += np.diff(response[:, :3], axis=0)
@@ -110,12 +133,8 @@ def covariance(
         seen, left = others
         variance = float(np.mean(left[left != 0.0] ** 2)) if left.any() else 1.0
         excess += coloured_information(seen, left) / variance - np.einsum("kcp,kcq->pq", seen, seen)
-    plain = np.diagonal(inverse)
-    coloured = plain + np.diagonal(inverse @ excess @ inverse)
     elapsed = np.r_[0.0, np.cumsum(model.knots.interval_s * model.knots.joined)]
-    by_blocks = variance_by_blocks(score @ inverse, elapsed)
-    enlarged = np.sqrt(np.maximum(1.0, np.maximum(coloured, by_blocks) / plain))
-    return np.asarray(inverse * np.outer(enlarged, enlarged))
+    return Noise(excess, score, elapsed)
 
 
 def inverse_information(information: Array) -> Array:

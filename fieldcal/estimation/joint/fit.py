@@ -31,7 +31,7 @@ from fieldcal.estimation.joint.chain_solver import (
     solve_scaled,
     whitened_motion,
 )
-from fieldcal.estimation.joint.covariance import RowSums, covariance, inverse_information, sums_of_rows
+from fieldcal.estimation.joint.covariance import Noise, RowSums, inverse_information, noise_of, sums_of_rows
 from fieldcal.estimation.joint.measurement_model import (
     SENSED,
     Rows,
@@ -107,10 +107,11 @@ class Options:
 class JointFit:
     """The solution in centred coordinates; θ is ordered by `layout`.
 
-    `covariance` (p, p) of θ, coloured-residual form; `information` (p, p) with the knots eliminated; `weight` (m, r)
-    robust weights; `iterations` of all rounds; `bias_walk` of the gyroscope's bias, rad/s/√s, whose spread over the
-    record is part of its covariance; `lever_arm_test` the Wald statistic (χ²₃) of a free lever arm, None where it was
-    not estimated."""
+    `covariance` (p, p) of θ, coloured-residual form; `information` (p, p) with the knots eliminated, of which `known`
+    (p, p) is what was known beforehand, whose part of the gradient is `pull` (p,); `noise` as the residuals show it
+    and `doubt` (p, p) beside noise, both in the covariance already; `weight` (m, r) robust weights; `iterations` of all
+    rounds; `bias_walk` of the gyroscope's bias, rad/s/√s, whose spread over the record is part of its covariance;
+    `lever_arm_test` the Wald statistic (χ²₃) of a free lever arm, None where it was not estimated."""
 
     model: Model
     state: State
@@ -121,6 +122,10 @@ class JointFit:
     covariance: Array
     information: Array
     iterations: int
+    known: Array
+    pull: Array
+    noise: Noise | None
+    doubt: Array
     bias_walk: float = 0.0
     lever_arm_test: float | None = None
     vps: VpsRecord | None = None
@@ -130,6 +135,11 @@ class JointFit:
     def priors(self) -> Mapping[str, PriorConstants]:
         """What was known beforehand, by sensor."""
         return self.options.priors
+
+    def doubted(self, change: Array) -> JointFit:
+        """The same, θ doubted by a change (p,) of it."""
+        by = np.outer(change, change)
+        return replace(self, covariance=self.covariance + by, doubt=self.doubt + by)
 
     def constants(self, name: str) -> tuple[Array, Array, Array]:
         """(λ (3,), b (3,), covariance (6, 6)) of a triad without cross-axis terms, logged units."""
@@ -260,11 +270,10 @@ def _or_without_arm(fit: JointFit, without: JointFit) -> JointFit:
     """The fit, half of what a lever arm changes of the accelerometer's constants in their sd: a hand that turns an IMU
     has a pivot, which passes every test that an arm of the sensor passes (it explains a third of the acceleration, as
     an arm on a vehicle does) but is not as constant."""
-    columns = fit.layout["accelerometer"]
-    change = 0.5 * (fit.state.values["accelerometer"] - without.state.values["accelerometer"])
-    covariance = fit.covariance.copy()
-    covariance[columns, columns] += np.outer(change, change)
-    return replace(fit, covariance=covariance)
+    change = np.zeros(len(fit.covariance))
+    moved = fit.state.values["accelerometer"] - without.state.values["accelerometer"]
+    change[fit.layout["accelerometer"]] = 0.5 * moved
+    return fit.doubted(change)
 
 
 def _lever_arm_test(fit: JointFit) -> float:
@@ -285,13 +294,17 @@ def _enlarged(fit: JointFit, response: Array) -> JointFit:
     jumps = fit.path.jump, np.sqrt(knots.joined / (fit.levels.walk * knots.interval_s))
     strength = fit.levels.strength
     process = whitened_motion(knots, strength, response[:, 3:]), whitened_motion(knots, strength, fit.state.motion)
-    enlarged = covariance(fit.model, rows, response, fit.information, jumps, process, poses)
+    noise = noise_of(fit.model, rows, response, jumps, process, poses)
+    inverse = inverse_information(fit.information)
+    factors = noise.enlargement(inverse, np.diagonal(inverse))
+    doubt: Array = np.zeros_like(fit.information)
     # The bias is the mean over the record, from which its random walk takes it away towards either end.
     rate = body_jumps(fit.state, fit.path) / knots.interval_s[:, None]
     walk = bias_walk(rate, knots.interval_s, knots.joined)
     bias = np.arange(3, 6) + fit.layout["gyroscope"].start
-    enlarged[bias, bias] += walk**2 * (fit.model.readings.t[-1] - fit.model.readings.t[0]) / 3.0
-    return replace(fit, covariance=enlarged, bias_walk=walk)
+    doubt[bias, bias] = walk**2 * (fit.model.readings.t[-1] - fit.model.readings.t[0]) / 3.0
+    enlarged = inverse * np.outer(factors, factors) + doubt
+    return replace(fit, covariance=enlarged, noise=noise, doubt=doubt, bias_walk=walk)
 
 
 def _iterate(model: Model, state: State, levels: Levels | None, spent: int, how: Options) -> tuple[JointFit, Array]:
@@ -346,9 +359,9 @@ def _iterate(model: Model, state: State, levels: Levels | None, spent: int, how:
         converged = max(level_change, float(np.max(np.abs(change) / sd))) < CONVERGED_STEP_SD
         if converged or float(np.max(np.abs(change))) < SMALLEST_STEP:
             plain = inverse_information(information)
-            fit = JointFit(
-                model, state, path, levels, weight, layout, plain, information, spent + iteration, vps=vps, options=how
-            )
+            solution = model, state, path, levels, weight, layout, plain, information, spent + iteration
+            known = prior.information, prior.pull(state, layout), None, np.zeros((p, p))
+            fit = JointFit(*solution, *known, vps=vps, options=how)
             return fit, eliminated.solved(slice(p))
     raise _no_minimum(model, iteration)
 
@@ -438,10 +451,14 @@ class _Prior:
                 information[columns, columns] = transform.T @ np.linalg.inv(known.covariance) @ transform
         return cls(mean, information)
 
-    def add(self, normal: Normal, state: State, layout: Mapping[str, slice]) -> None:
+    def pull(self, state: State, layout: Mapping[str, slice]) -> Array:
+        """Its part (p,) of the gradient."""
         now = np.concatenate([state.values[name] for name in layout])
+        return np.asarray(self.information @ (self.mean - now))
+
+    def add(self, normal: Normal, state: State, layout: Mapping[str, slice]) -> None:
         normal.parameters += self.information
-        normal.parameters_right[:, GRADIENT] += self.information @ (self.mean - now)
+        normal.parameters_right[:, GRADIENT] += self.pull(state, layout)
 
 
 def _step_share(state: State, step: Array, theta: Array, layout: Mapping[str, slice]) -> float:

@@ -73,16 +73,13 @@ def add_terms(fit: JointFit) -> tuple[JointFit, list[TermTest]]:
 
 def _doubted(fit: JointFit, moved: list[dict[str, Array]]) -> JointFit:
     """The fit with these changes of its parameters, by name, in the covariance."""
-    if not moved:
-        return fit
-    covariance = fit.covariance.copy()
     for change in moved:
-        by = np.zeros(len(covariance))
+        by = np.zeros(len(fit.covariance))
         for name, values in change.items():
             if name in fit.layout:  # the term itself is not; a lever arm is tested anew beside the terms
                 by[fit.layout[name]] = values
-        covariance += np.outer(by, by)
-    return replace(fit, covariance=covariance)
+        fit = fit.doubted(by)
+    return fit
 
 
 def with_terms(fit: JointFit, names: list[str]) -> JointFit:

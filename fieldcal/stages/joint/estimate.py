@@ -29,6 +29,7 @@ from fieldcal.stages.joint.by_vps import (
     not_used,
     poses_of,
 )
+from fieldcal.stages.joint.information import information_of
 from fieldcal.stages.joint.judgement import judged, judged_scales, judged_zeros, measured_of, triad_of
 from fieldcal.stages.joint.readings import readings_of, start_constants
 from fieldcal.stages.results import StageResult, fatal_fault, fault_rows, triad_rows, zero_slope_rows
@@ -300,6 +301,14 @@ def _written(
             "None of the sensors that method joint is chosen for has readings.",
         )
     result = {"calibration": calibration_rows(rows), "covariance": covariance_table(fit.covariance)}
+    result["information"] = information_of(
+        fit,
+        {sensor: found.codes for sensor, found in triads.items()},
+        by_pose,
+        _axes(s),
+        units={sensor: (UNITS[sensor] or s.field_unit, s.units[sensor]) for sensor in SENSORS},
+        temperature_degc=mean_temperature(tables),
+    )
     if fit.vps is not None or not any(_of_fit(fit, Sensor.GYROSCOPE, s).codes):
         result["trajectory"] = _trajectory(attitude, tables, _axes(s))
     return StageResult(result, Status.REFUSED if every else Status.OK, first, reason, measured)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_record import small
 
-from fieldcal.estimation.joint.covariance import advice, covariance, inverse_information, sums_of_rows
+from fieldcal.estimation.joint.covariance import advice, inverse_information, noise_of, sums_of_rows
 from fieldcal.estimation.joint.measurement_model import Rows
 from fieldcal.estimation.joint.problem import Model
 from fieldcal.estimation.statistics import coloured_information, variance_by_blocks
@@ -59,10 +59,13 @@ class Given:
         ]
 
     def found(self, *, poses: bool) -> Array:
-        return covariance(
+        noise = noise_of(
             self.model, sums_of_rows(self.model, iter(self.rows()), self.response, self.whitening), self.response,
-            self.information, self.jumps, self.process, self.poses if poses else None,
+            self.jumps, self.process, self.poses if poses else None,
         )  # fmt: skip
+        inverse = inverse_information(self.information)
+        larger = noise.enlargement(inverse, np.diagonal(inverse))
+        return inverse * np.outer(larger, larger)
 
     def by_loops(self, *, poses: bool) -> tuple[Array, Array]:
         """Diagonals of the inverse enlarged by colour, and of the variance by blocks."""

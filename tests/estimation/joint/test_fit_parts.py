@@ -17,6 +17,7 @@ from test_score_corrections import Flight, stamps
 from fieldcal.errors import EstimationError
 from fieldcal.estimation.joint import fit as joint_fit
 from fieldcal.estimation.joint.chain_solver import BRIDGE, GRADIENT, Normal, Probe, whitened_motion
+from fieldcal.estimation.joint.covariance import Noise
 from fieldcal.estimation.joint.fit import JointFit, Options, fit_joint, linearised
 from fieldcal.estimation.joint.measurement_model import body_jumps, layout_of, residuals, trajectory
 from fieldcal.estimation.joint.problem import TRIADS, Model, PriorConstants, State
@@ -37,7 +38,9 @@ def made(flight: Small | Flight, *, covariance: Array | None = None, **changes: 
     own = root @ root.T if covariance is None else covariance
     weight = np.ones((len(flight.model.at), 3 * len(flight.model.vectors)))
     path = trajectory(flight.model, flight.state)
-    found = JointFit(flight.model, flight.state, path, flight.levels, weight, layout, own, np.linalg.inv(own), 3)
+    known = np.zeros((p, p)), np.zeros(p), None, np.zeros((p, p))
+    solution = flight.model, flight.state, path, flight.levels, weight, layout, own, np.linalg.inv(own), 3
+    found = JointFit(*solution, *known)
     return replace(found, **changes)
 
 
@@ -493,9 +496,9 @@ def test_the_bias_walk_over_the_record_is_in_the_bias_alone(monkeypatch: pytest.
     k, p = len(flight.state.q), len(fit.covariance)
     asked: list[Any] = []
 
-    def covariance(model: Any, rows: Any, response: Any, information: Any, *others: Any) -> Array:
+    def noise_of(model: Any, rows: Any, response: Any, *others: Any) -> Noise:
         asked.append(others)
-        return fit.covariance.copy()
+        return Noise(np.zeros((p, p)), np.zeros((k, p)), np.arange(float(k)))
 
     whitened: list[Array] = []
     rates: list[Any] = []
@@ -506,7 +509,7 @@ def test_the_bias_walk_over_the_record_is_in_the_bias_alone(monkeypatch: pytest.
 
     monkeypatch.setattr(joint_fit.compiled, "LIBRARY", None)
     monkeypatch.setattr(joint_fit, "sums_of_rows", lambda *given: whitened.append(given[3]))
-    monkeypatch.setattr(joint_fit, "covariance", covariance)
+    monkeypatch.setattr(joint_fit, "noise_of", noise_of)
     monkeypatch.setattr(joint_fit, "bias_walk", bias_walk)
     response = np.random.default_rng(8).normal(size=(k, 12, p))
     found = joint_fit._enlarged(fit, response)
@@ -514,6 +517,7 @@ def test_the_bias_walk_over_the_record_is_in_the_bias_alone(monkeypatch: pytest.
     t = flight.model.readings.t
     added[3:6] = 0.09 * (t[-1] - t[0]) / 3.0
     np.testing.assert_allclose(found.covariance - fit.covariance, np.diag(added), atol=1e-9)
+    np.testing.assert_array_equal(found.doubt, np.diag(added))
     assert found.bias_walk == 0.3
     knots, levels = flight.model.knots, flight.levels
     (whitening,) = whitened

@@ -1,0 +1,1 @@
+"""Many flights of a unit together: what each knows, smoothed over sessions."""

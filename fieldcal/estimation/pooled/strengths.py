@@ -1,0 +1,155 @@
+"""How much constants of a kind move, by marginal likelihood over all units of the fleet: siblings share it.
+
+A series is one constant of one unit: what each session says of it, y with variance v (of estimation). It is modelled as
+y = c + β (T − T̄) + u + e with a walk c of variance q a day, a scatter u of sessions of variance τ², which no number of
+flights in one session averages out, and a slope β of variance σ² among siblings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import brentq, minimize
+
+from fieldcal.geometry.rotation import Array
+
+RESTART_SD = 4.5
+"""An innovation beyond it is a step or spoiled: the series starts anew, and tells nothing of its usual movement."""
+LIMITS = 2.0 * np.log(1e-3), 2.0 * np.log(1e3)
+"""Of logarithms of variances that are looked for, over that of a session (by the median gap and the range)."""
+FEW = 4.0
+"""Innovations that the expectation of half a session's own sd counts for: little beside many."""
+EXPECTED_SHARE = 0.5
+RISE = 0.3
+"""Of minus twice the logarithm of the likelihood that a strength is still likely at: half a standard deviation."""
+TOLERANCES = {"fatol": 0.05, "xatol": 0.1}
+START = 0.2, 0.4, 0.5
+"""Sd of walk, scatter and slope over that of a session itself, from where the likeliest are looked for."""
+
+
+@dataclass(frozen=True)
+class Strengths:
+    """Of one kind of constant: variance of the `walk` a day, of the `scatter` of sessions, of the `slope` on
+    temperature, (unit²/°C²)."""
+
+    walk: float
+    scatter: float
+    slope: float
+    freedom: float = 1e6
+    """Innovations that they were estimated from: so uncertain is what is divided by them."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """`day`, `temperature_degc` less the reference, `value` and `variance` of estimation, each (m, n): m sessions of n
+    series, NaN where a series has no more."""
+
+    day: Array
+    warmth_degc: Array
+    value: Array
+    variance: Array
+
+    @classmethod
+    def of(cls, rows: list[Array]) -> Series:
+        """Of arrays (k, 4), one a series."""
+        longest = max(map(len, rows), default=0)
+        padded = np.full((4, longest, len(rows)), np.nan)
+        for j, own in enumerate(rows):
+            padded[:, : len(own), j] = own.T
+        return cls(*padded)
+
+
+def innovations(series: Series, strengths: Strengths) -> tuple[Array, Array]:
+    """One-step prediction errors over their sd and the variances, (m, n); NaN where there are none: at the first
+    session of each series, and where it starts anew."""
+    count, width = series.value.shape
+    z, variance = np.full((2, count, width), np.nan)
+    c, slope = np.zeros((2, width))
+    of_c, p_cs, p_ss = np.zeros(width), np.zeros(width), np.full(width, strengths.slope)
+    started, last = np.zeros(width, dtype=bool), np.zeros(width)
+    for k in range(count):
+        day, t, y = series.day[k], series.warmth_degc[k], series.value[k]
+        here = np.isfinite(y)
+        r = series.variance[k] + strengths.scatter
+        of_c = of_c + strengths.walk * np.where(started, day - last, 0.0)
+        s = of_c + 2.0 * t * p_cs + t**2 * p_ss + r
+        error = y - c - slope * t
+        usual = here & started & (error**2 < RESTART_SD**2 * s)
+        z[k, usual], variance[k, usual] = (error / np.sqrt(s))[usual], s[usual]
+        gain_c, gain_s = (of_c + t * p_cs) / s, (p_cs + t * p_ss) / s
+        anew = here & ~usual
+        new_c = of_c - gain_c**2 * s, p_cs - gain_c * gain_s * s, p_ss - gain_s**2 * s
+        start = r + t**2 * p_ss, -t * p_ss, p_ss
+        c, slope = (
+            np.where(usual, c + gain_c * error, np.where(anew, y - slope * t, c)),
+            np.where(usual, slope + gain_s * error, slope),
+        )
+        of_c, p_cs, p_ss = (
+            np.where(usual, a, np.where(anew, b, old))
+            for a, b, old in zip(new_c, start, (of_c, p_cs, p_ss), strict=True)
+        )
+        started, last = started | here, np.where(here, day, last)
+    return z, variance
+
+
+def strengths_of(series: Series, *, with_slope: bool = True) -> Strengths:
+    """The strengths that make the series' innovations likeliest.
+
+    Few innovations cannot tell a little from nothing: then the scatter, and what the slope does over the temperatures
+    flown, are taken for half of a session's own sd. Without
+    any two sessions to compare nothing is known to move, but the scatter is that."""
+    known = np.isfinite(series.value)
+    if not known.any():
+        return Strengths(0.0, 0.0, 0.0, FEW)
+    own = float(np.median(series.variance[known]))
+    gap = np.diff(series.day, axis=0)
+    gap_day = float(np.median(gap[np.isfinite(gap) & (gap > 0.0)])) if np.any(gap > 0.0) else 1.0
+    warmth = series.warmth_degc[known]
+    range_degc = max(float(np.std(warmth)), 1.0)
+    expected = EXPECTED_SHARE**2 * own
+    if (known.sum(axis=0) < 2).all():
+        return Strengths(0.0, expected, own / range_degc**2 if with_slope else 0.0, FEW)
+    units = np.array([own / gap_day, own, own / range_degc**2])
+
+    def given(x: Array) -> Strengths:
+        walk, scatter, slope = units * np.exp(np.clip(np.r_[x, -np.inf][:3], *LIMITS))
+        return Strengths(float(walk), float(scatter), float(slope) if with_slope else 0.0)
+
+    def cost(x: Array) -> float:
+        strengths = given(x)
+        z, variance = innovations(series, strengths)
+        at = np.isfinite(z)
+        started_anew = known.sum() - at.sum()
+        likelihood = np.sum(np.log(variance[at] / own) + z[at] ** 2) + started_anew * RESTART_SD**2
+        few = _unlikely(strengths.scatter / own)
+        if with_slope:
+            few += _unlikely(strengths.slope / units[2])
+        outside = np.sum(np.maximum(np.abs(x) - LIMITS[1], 0.0) ** 2)
+        return float(likelihood + few + outside)
+
+    size = 3 if with_slope else 2
+    simplex = np.log(np.square(START[:size])) + np.eye(size + 1, size, -1)
+    best = minimize(cost, simplex[0], method="Nelder-Mead", options={**TOLERANCES, "initial_simplex": simplex})
+    most = [_largest_likely(cost, best.x, best.fun, i) for i in range(size)]
+    found = given(np.array(most))
+    return replace(found, freedom=FEW + float(np.isfinite(innovations(series, found)[0]).sum()))
+
+
+def _unlikely(ratio: float) -> float:
+    """Minus twice the logarithm of the chance of a variance beforehand, over that of a session itself."""
+    return float(FEW * (np.log(ratio) + EXPECTED_SHARE**2 / ratio))
+
+
+def _largest_likely(cost: Callable[[Array], float], best: Array, least: float, i: int) -> float:
+    """The largest element i of x that is likely (`RISE`): a strength that the fleet hardly shows is
+    not taken for none."""
+    low, high = float(best[i]), LIMITS[1]
+
+    def rise(value: float) -> float:
+        x = best.copy()
+        x[i] = value
+        return cost(x) - least - RISE
+
+    return float(brentq(rise, low, high, xtol=0.05)) if rise(high) > 0.0 else low

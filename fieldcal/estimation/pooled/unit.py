@@ -1,0 +1,335 @@
+"""The flights of one unit pooled: sessions in order of time, steps where they are, flights left out that contradict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.stats import f as f_distribution
+from scipy.stats import t as t_distribution
+
+from fieldcal.estimation.normal_equations import Name, NormalEquations
+from fieldcal.estimation.pooled.chain import Chain, Estimate, Known
+from fieldcal.estimation.pooled.strengths import Series, Strengths, strengths_of
+from fieldcal.geometry.rotation import Array
+
+SLOPED = ("gain", "zero")
+"""Constants that depend on temperature."""
+OF_SLOPE = {"zero_per_degc": "zero"}
+"""Parameters of a flight that are slopes of a constant."""
+FALSE_ALARMS = 0.003
+"""Chance that a unit without any has a step, and that it has a flight left out."""
+FEWEST_TO_CONTRADICT, FEWEST_BESIDE_A_STEP = 3, 2
+"""Sessions that it takes to say of one flight that it contradicts; of either side of a step."""
+LARGEST_LEFT_OUT = 0.2
+"""Share of flights: where more contradict, nobody knows which."""
+UNTESTABLE = 1e4
+"""Variance of what others expect along a direction over a flight's own: beyond it the flight cannot contradict."""
+LEAST_SHARE = 1e-4
+"""Of the information on a constant: a session that adds less of it says nothing."""
+
+
+@dataclass(frozen=True)
+class Flight:
+    """`equations` of a flight, in coordinates that its siblings share; `session` counts from 0 in order of time;
+    `warmth_degc` its temperature less the reference, None where nobody knows it."""
+
+    equations: NormalEquations
+    session: int
+    warmth_degc: float | None
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Flights of one unit and the `day` (m,) of their sessions."""
+
+    flights: tuple[Flight, ...]
+    day: Array
+
+    @property
+    def names(self) -> tuple[Name, ...]:
+        """The constants of the unit."""
+        seen = {name for flight in self.flights for name in flight.equations.names if name[1] not in OF_SLOPE}
+        return tuple(sorted(seen))
+
+
+@dataclass(frozen=True)
+class Step:
+    """One constant steps between session `after` − 1 and `after`, by `size` with sd `sd`; `z` before it was one."""
+
+    name: Name
+    after: int
+    size: float
+    sd: float
+    z: float
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A flight that contradicts the others: χ² of what it says against what they expect, of `freedom` combinations."""
+
+    flight: int
+    chi2: float
+    freedom: int
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """What all flights of a unit say together; the state is constants at the reference temperature, then slopes."""
+
+    names: tuple[Name, ...]
+    sloped: tuple[int, ...]
+    chain: Chain
+    raw: tuple[Known, ...]
+    """What each flight says, of the state."""
+    unit: Unit
+    scatter: Array
+    steps: tuple[Step, ...] = ()
+    left_out: tuple[LeftOut, ...] = field(default=())
+
+    def at(self, day: float | None = None) -> Estimate:
+        """Constants and slopes, at the last session unless a day is given."""
+        return self.chain.at(float(self.unit.day[-1]) if day is None else day).estimate()
+
+    def combination(self, place: int, warmth_degc: float = 0.0) -> Array:
+        """That of the state (d,) which is constant `place` at a temperature."""
+        out = np.zeros(len(self.scatter))
+        out[place] = 1.0
+        if place in self.sloped:
+            out[len(self.names) + self.sloped.index(place)] = warmth_degc
+        return out
+
+    def expected(self, flight: int) -> Known:
+        """What all other flights say of the constants as this one met them."""
+        session = self.unit.flights[flight].session
+        known = self.chain.others(session).loosened(self.scatter)
+        out = {one.flight for one in self.left_out}
+        for k, other in enumerate(self.unit.flights):
+            if other.session == session and k != flight and k not in out:
+                known = known + self.raw[k]
+        return known
+
+    def contributions(self) -> Array:
+        """Of each flight and constant (n, p): the share of what is known of it then that would not be known without."""
+        share = np.zeros((len(self.raw), len(self.names)))
+        for k, own in enumerate(self.raw):
+            if k in {one.flight for one in self.left_out}:
+                continue
+            others = self.expected(k)
+            before, together = (np.diagonal(x.estimate().covariance)[: len(self.names)] for x in (others, others + own))
+            known = np.isfinite(together)
+            share[k, known] = 1.0 - np.where(np.isfinite(before[known]), together[known] / before[known], 0.0)
+        return share
+
+
+Kinds = Mapping[tuple[str, str], Strengths]
+"""Strengths by sensor and parameter."""
+
+
+def pool(unit: Unit, kinds: Kinds, *, tested: bool = True) -> Pooled:
+    """Smooth a unit's flights; `tested`: look for steps and for flights that contradict the others, the surest first,
+    until there is none."""
+    names, sloped = unit.names, tuple(k for k, name in enumerate(unit.names) if name[1] in SLOPED)
+    raw = tuple(state_of(flight, names, sloped, _usual_warmth(unit)) for flight in unit.flights)
+    strengths = [kinds[name[:2]] for name in names]
+    nothing = np.zeros(len(sloped))
+    scatter = np.r_[[s.scatter for s in strengths], nothing]
+    walk = np.r_[[s.walk for s in strengths], nothing]
+    variance = np.array([strengths[k].slope for k in sloped])
+    flat = np.diag(np.r_[np.zeros(len(names)), 1.0 / np.maximum(variance, 1e-300)])
+    first = Known(np.where(flat > 1e290, 0.0, flat), np.zeros(len(flat)))
+    jump = np.zeros((len(unit.day) - 1, len(flat)))
+    found = _smoothed(names, sloped, raw, unit, scatter, walk, jump, first, (), ())
+    freedom = np.array([s.freedom for s in strengths])
+    while tested:
+        worst, step = _worst_flight(found, freedom), _surest_step(found, freedom)
+        if worst is None and step is None:
+            break
+        if step is not None and (worst is None or step[0] <= worst[0]):
+            jump[step[1].after - 1, names.index(step[1].name)] = np.inf
+            found = replace(found, steps=(*found.steps, step[1]))
+        elif worst is not None:
+            found = replace(found, left_out=(*found.left_out, worst[1]))
+        found = _smoothed(names, sloped, raw, unit, scatter, walk, jump.copy(), first, found.steps, found.left_out)
+    return found
+
+
+def _usual_warmth(unit: Unit) -> float:
+    known = [flight.warmth_degc for flight in unit.flights if flight.warmth_degc is not None]
+    return float(np.mean(known)) if known else 0.0
+
+
+def state_of(flight: Flight, names: tuple[Name, ...], sloped: tuple[int, ...], usual_degc: float) -> Known:
+    """A flight's equations as those of the state: the constants at its temperature are constants plus slopes."""
+    own = flight.equations
+    warmth = usual_degc if flight.warmth_degc is None else flight.warmth_degc
+    design = np.zeros((len(own.names), len(names) + len(sloped)))
+    for row, name in enumerate(own.names):
+        constant = (name[0], OF_SLOPE.get(name[1], name[1]), name[2])
+        place = names.index(constant)
+        slope = len(names) + sloped.index(place) if place in sloped else None
+        if name[1] in OF_SLOPE:
+            design[row, slope] = 1.0
+            continue
+        design[row, place] = 1.0
+        if slope is not None:
+            design[row, slope] = warmth
+    right = own.right + own.information @ own.reference
+    return Known(design.T @ own.information @ design, design.T @ right)
+
+
+def _smoothed(
+    names: tuple[Name, ...],
+    sloped: tuple[int, ...],
+    raw: tuple[Known, ...],
+    unit: Unit,
+    scatter: Array,
+    walk: Array,
+    jump: Array,
+    first: Known,
+    steps: tuple[Step, ...],
+    left_out: tuple[LeftOut, ...],
+) -> Pooled:
+    out = {one.flight for one in left_out}
+    sessions = [Known.nothing(len(scatter)) for _ in unit.day]
+    for k, flight in enumerate(unit.flights):
+        if k not in out:
+            sessions[flight.session] = sessions[flight.session] + raw[k]
+    own = [known.loosened(scatter) for known in sessions]
+    chain = Chain.of(unit.day, own, walk, jump, first)
+    return Pooled(names, sloped, chain, raw, unit, scatter, steps, left_out)
+
+
+def _worst_flight(found: Pooled, freedom: Array) -> tuple[float, LeftOut] | None:
+    """The flight that contradicts the others most, if one does, and the logarithm of its chance."""
+    flights = found.unit.flights
+    out = {one.flight for one in found.left_out}
+    left = [k for k in range(len(flights)) if k not in out]
+    sessions = {flights[k].session for k in left}
+    if len(sessions) < FEWEST_TO_CONTRADICT or len(out) + 1 > max(1.0, LARGEST_LEFT_OUT * len(flights)):
+        return None
+    tested = [(k, *contradiction(found.raw[k], found.expected(k))) for k in left]
+    tested = [one for one in tested if one[2] > 0]
+    if not tested:
+        return None
+    chi2, count = (np.array([one[i] for one in tested]) for i in (1, 2))
+    chance = f_distribution.logsf(chi2 / count, count, float(np.median(freedom)))
+    worst = int(np.argmin(chance))
+    certain = chance[worst] < np.log(FALSE_ALARMS / len(flights))
+    return (float(chance[worst]), LeftOut(*tested[worst])) if certain else None
+
+
+def contradiction(own: Known, expected: Known) -> tuple[float, int]:
+    """χ² of what a flight says against what is expected, and of how many combinations: those that both know."""
+    scale = np.where(np.diagonal(own.information) > 0.0, 1.0, 0.0)
+    size = np.sqrt(np.maximum(np.diagonal(own.information), 1e-300))
+    value, vector = np.linalg.eigh(own.information / np.outer(size, size) * np.outer(scale, scale))
+    seen = value > 1e-9
+    if not seen.any():
+        return 0.0, 0
+    # Unit-variance readings A x of the flight; what is expected gives them a covariance, vague where nothing is known.
+    reading = (vector[:, seen] * np.sqrt(value[seen])).T * size
+    said = (vector[:, seen].T @ (own.right / size)) / np.sqrt(value[seen])
+    vague = expected.information + np.diag(size**2 / UNTESTABLE**2)
+    covariance = reading @ np.linalg.solve(vague, reading.T)
+    error = said - reading @ np.linalg.solve(vague, expected.right)
+    spread, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    testable = spread < UNTESTABLE
+    if not testable.any():
+        return 0.0, 0
+    z2 = (axes[:, testable].T @ error) ** 2 / (1.0 + np.maximum(spread[testable], 0.0))
+    return float(z2.sum()), int(testable.sum())
+
+
+def _surest_step(found: Pooled, freedom: Array) -> tuple[float, Step] | None:
+    """The surest step of a constant between two sessions, if there is one, and the logarithm of its chance."""
+    chain, p = found.chain, len(found.names)
+    boundaries = range(FEWEST_BESIDE_A_STEP, len(chain.day) - FEWEST_BESIDE_A_STEP + 1)
+    if len(boundaries) == 0:
+        return None
+    size, information = np.zeros((2, len(boundaries), p))
+    for row, k in enumerate(boundaries):
+        variance = chain.walk * (chain.day[k] - chain.day[k - 1]) + chain.jump[k - 1]
+        past = (chain.before[k - 1] + chain.own[k - 1]).loosened(variance)
+        of_state = jumps(past, chain.after[k] + chain.own[k])
+        size[row], information[row] = (x[:p] for x in of_state)
+    z = size * np.sqrt(information)
+    chance = np.log(2.0) + t_distribution.logsf(np.abs(z), freedom)
+    row, i = (int(x) for x in np.unravel_index(int(np.argmin(chance)), chance.shape))
+    if not chance[row, i] < np.log(FALSE_ALARMS / z.size):
+        return None
+    sd = float(1.0 / np.sqrt(information[row, i]))
+    return float(chance[row, i]), Step(found.names[i], boundaries[row], float(size[row, i]), sd, float(z[row, i]))
+
+
+def jumps(past: Known, future: Known) -> tuple[Array, Array]:
+    """Of each element of the state alone: by how much it would have to be more in the future, (d,), and the information
+    on that; what past and future do not share is no jump."""
+    together = past + future
+    size = np.sqrt(np.maximum(np.diagonal(together.information), 1e-300))
+    inverse = np.linalg.pinv(together.information / np.outer(size, size), rcond=1e-10, hermitian=True)
+    covariance = inverse / np.outer(size, size)
+    n = future.information
+    full = np.diagonal(n)
+    information = full - np.einsum("ij,jk,ki->i", n, covariance, n)
+    right = future.right - n @ covariance @ together.right
+    information = np.where(information > 1e-9 * np.maximum(full, 1e-300), information, 0.0)
+    return np.where(information > 0.0, right / np.where(information > 0.0, information, 1.0), 0.0), information
+
+
+def strengths(units: Sequence[Unit], *, rounds: int = 2) -> dict[tuple[str, str], Strengths]:
+    """How much each kind of constant moves, of all units: what sessions say of a constant, given what the others say
+    of all others, is a series of `strengths_of`."""
+    kinds = _first_strengths(units)
+    for _ in range(rounds):
+        rows: dict[tuple[str, str], list[Array]] = {kind: [] for kind in kinds}
+        for unit in units:
+            found = pool(unit, kinds, tested=False)
+            for name, series in zip(found.names, _series(found), strict=True):
+                rows[name[:2]].append(series)
+        kinds = {
+            kind: strengths_of(Series.of([one for one in own if len(one)]), with_slope=kind[1] in SLOPED)
+            for kind, own in rows.items()
+        }
+    return kinds
+
+
+def _first_strengths(units: Sequence[Unit]) -> dict[tuple[str, str], Strengths]:
+    """To begin with: constants scatter as a flight alone sees them, and change by as much over a degree."""
+    own: dict[tuple[str, str], list[float]] = {}
+    for unit in units:
+        for flight in unit.flights:
+            for name, information in zip(
+                flight.equations.names, np.diagonal(flight.equations.information), strict=True
+            ):
+                if name[1] not in OF_SLOPE and information > 0.0:
+                    own.setdefault(name[:2], []).append(1.0 / float(information))
+    kinds = {kind: Strengths(0.0, float(np.median(v)), float(np.median(v))) for kind, v in own.items()}
+    return {name[:2]: kinds.get(name[:2], Strengths(0.0, 0.0, 0.0)) for unit in units for name in unit.names}
+
+
+def _series(found: Pooled) -> list[Array]:
+    """Of each constant (sessions, 4): day, temperature less the reference, value there and its variance, as the session
+    alone says where the other constants are what the other sessions say: what is known of the value with the session
+    less what is without."""
+    unit = found.unit
+    rows: list[list[tuple[float, ...]]] = [[] for _ in found.names]
+    for session, day in enumerate(unit.day):
+        at = [k for k, flight in enumerate(unit.flights) if flight.session == session]
+        own = sum((found.raw[k] for k in at), Known.nothing(len(found.scatter)))
+        warmth = [w for k in at if (w := unit.flights[k].warmth_degc) is not None]
+        warmth_degc = float(np.mean(warmth)) if warmth else _usual_warmth(unit)
+        others = found.chain.others(session).loosened(found.scatter)
+        before, together = others.estimate(), (others + own).estimate()
+        for place in range(len(found.names)):
+            combination = found.combination(place, warmth_degc)
+            (x, v), (x_others, v_others) = together.of(combination), before.of(combination)
+            if not np.isfinite(v):
+                continue
+            known = 1.0 / v_others if np.isfinite(v_others) else 0.0
+            information = 1.0 / v - known
+            if information > LEAST_SHARE / v:
+                value = (x / v - (x_others * known if known else 0.0)) / information
+                rows[place].append((float(day), warmth_degc, value, 1.0 / information))
+    return [np.array(own).reshape(-1, 4) for own in rows]

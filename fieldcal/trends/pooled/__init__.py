@@ -1,0 +1,1 @@
+"""Constants of a unit from what all its flights know together."""

@@ -1,0 +1,202 @@
+"""A pooled unit as rows of the table `pooled`: scale and zero instead of gain and zero, judged, in words."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+
+from fieldcal.config.parameters import Parameters
+from fieldcal.estimation.normal_equations import Name
+from fieldcal.estimation.pooled.chain import Estimate
+from fieldcal.estimation.pooled.unit import Kinds, Pooled
+from fieldcal.geometry.earth_field import UNIT_IN_TESLA
+from fieldcal.geometry.rotation import Array
+from fieldcal.names import DriftStatus, Sensor, Status
+from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas.columns import LEAD
+from fieldcal.schemas.reference import REFERENCE_DEGC
+from fieldcal.trends.pooled.units import HistoryUnit
+
+INFORMED_SHARE = 0.5
+"""Of what is known of a zero before any flight: one that is not known better is refused, as a flight's is."""
+FIELD_T = 5e-5
+"""The earth's field, about."""
+TURN = "Turn it 60° either way about the sensor's {axis} axis, several times."
+TILT = "Turn it over, so that the sensor's {axis} axis points up, down and level."
+Row = dict[str, object]
+
+
+def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds) -> list[Row]:
+    """Rows of each constant; of a unit whose flights say nothing none."""
+    if not any(own.information.any() for own in found.raw):
+        return []
+    now = found.at()
+    out = {left.flight for left in found.left_out}
+    sessions = {flight.session for k, flight in enumerate(found.unit.flights) if k not in out}
+    unconfirmed = bool(out) and len(found.unit.day) - 1 not in sessions
+    left_out = [one.flight_ids[k] for k in sorted(out)]
+    shares = found.contributions()
+    factor, value, covariance = _in_history(one, found, now)
+    degc = _best_degc(found, now, one.temperatures_degc)
+    rows: list[Row] = []
+    for place, name in enumerate(found.names):
+        strength = kinds[name[:2]]
+        size = abs(factor[place])
+        refusal = _refusal(found, now, place, name, degc[place], one)
+        status, code, reason = Status.OK.value, None, _sentence(found, place, shares[:, place], left_out)
+        step = next((s for s in reversed(found.steps) if s.name == name), None)
+        if refusal:
+            status, code, reason = Status.REFUSED.value, ReasonCode.SCALE_UNCERTAIN.value, refusal
+        elif unconfirmed:
+            status = DriftStatus.INSUFFICIENT.value
+            reason = (
+                "The last session contradicts those before it and was left out: spoiled, or the first after a step. "
+                "Another session tells."
+            )
+        elif step is not None:
+            status = DriftStatus.STEP.value
+        slope = found.sloped.index(place) + len(found.names) if place in found.sloped else None
+        known = bool(np.isfinite(now.covariance[place, place]))
+        sloped = slope is not None and bool(np.isfinite(now.covariance[slope, slope]))
+        own = {
+            **{column.name: one.last[column.name] for column in LEAD},
+            "unit_id": one.sensor_unit_ids[name[0]],
+            "is_primary": one.last["is_primary"],
+            "sensor": name[0],
+            "parameter": _parameter(name),
+            "axis": name[2],
+            "unit": _unit(one, name),
+            "value_at_25degc": float(value[place]) if known else None,
+            "sd": float(np.sqrt(covariance[place, place])) if known else None,
+            "slope_per_degc": float(factor[place] * now.state[slope]) if sloped and known else None,
+            "slope_per_degc_sd": float(size * np.sqrt(now.covariance[slope, slope])) if sloped and known else None,
+            "best_known_degc": degc[place] if known else None,
+            "temperature_min_degc": None if one.temperatures_degc is None else one.temperatures_degc[0],
+            "temperature_max_degc": None if one.temperatures_degc is None else one.temperatures_degc[1],
+            "session_sd": size * float(np.sqrt(strength.scatter)) if known else None,
+            "walk_per_sqrt_day": size * float(np.sqrt(strength.walk)) if known else None,
+            "slope_spread": size * float(np.sqrt(strength.slope)) if sloped and known else None,
+            "n_innovations": float(strength.freedom),
+            "n_flights": int(np.sum(shares[:, place] > 0.0)),
+            "n_sessions": len({f.session for k, f in enumerate(found.unit.flights) if shares[k, place] > 0.0}),
+            "change_at": None if step is None else _moment(found.unit.day[step.after], one),
+            "change_size": None if step is None else float(factor[place] * step.size),
+            "change_size_sd": None if step is None else float(size * step.sd),
+            "pooled_with": one.pooled_with,
+            "place": place,
+            "covariance": [float(v) for v in np.nan_to_num(covariance[place, : place + 1])] if known else None,
+            "flights": list(one.flight_ids),
+            "shares": [float(v) for v in shares[:, place]],
+            "left_out": left_out,
+            "status": status,
+            "reason_code": code,
+            "reason": reason,
+        }
+        rows.append(own)
+    return rows
+
+
+def _parameter(name: Name) -> str:
+    return "scale" if name[1] == "gain" else name[1]
+
+
+def _unit(one: HistoryUnit, name: Name) -> str:
+    """As in `calibration`: a scale's is the calibrated unit over the logged one."""
+    unit = one.units[name]
+    if name[1] != "gain" or unit == "1":
+        return unit
+    logged = one.units.get((name[0], "zero", name[2]), "")
+    calibrated = unit.removeprefix(logged).removeprefix("/").strip("()")
+    return f"{calibrated}/({logged})" if "/" in logged else f"{calibrated}/{logged}"
+
+
+def _in_history(one: HistoryUnit, found: Pooled, now: Estimate) -> tuple[Array, Array, Array]:
+    """(derivative by the pooled constant (p,), value (p,), covariance (p, p)) of what the history calls it."""
+    p = len(found.names)
+    factor, value = np.zeros(p), np.zeros(p)
+    for place, name in enumerate(found.names):
+        own = now.state[place] * one.per[name]
+        value[place], factor[place] = own, one.per[name]
+        if name[1] == "gain" and own != 0.0:
+            value[place], factor[place] = 1.0 / own, -one.per[name] / own**2
+    with np.errstate(invalid="ignore"):
+        covariance = now.covariance[:p, :p] * np.outer(factor, factor)
+    return factor, value, covariance
+
+
+def _best_degc(found: Pooled, now: Estimate, flown: tuple[float, float] | None) -> list[float]:
+    """Temperature at which each constant is known best."""
+    out = []
+    for place in range(len(found.names)):
+        degc = REFERENCE_DEGC
+        if place in found.sloped and flown is not None:
+            slope = found.sloped.index(place) + len(found.names)
+            variance = now.covariance[slope, slope]
+            if np.isfinite(variance) and variance > 0.0:
+                degc -= float(now.covariance[place, slope] / variance)
+        out.append(degc)
+    return out
+
+
+def _refusal(found: Pooled, now: Estimate, place: int, name: Name, best: float, one: HistoryUnit) -> str | None:
+    """Why a constant is not known well enough, with the motion that would show it; None where it is.
+
+    Judged at the temperature, of those flown, at which it is known best."""
+    limit, scale, unit = limit_of(one, name)
+    if limit is None:
+        return None if np.isfinite(now.covariance[place, place]) else f"No flight shows {words_of(name)}."
+    at = best if one.temperatures_degc is None else float(np.clip(best, *one.temperatures_degc))
+    value, variance = now.of(found.combination(place, at - REFERENCE_DEGC))
+    sd = np.sqrt(variance) / (abs(value) if name[1] == "gain" else 1.0)
+    if sd <= limit:
+        return None
+    motion = (TURN if name[0] == Sensor.GYROSCOPE and name[1] == "gain" else TILT).format(axis=name[2])
+    told = (
+        f"{len(found.raw)} flights together do not show {words_of(name)} at all."
+        if not np.isfinite(sd)
+        else f"The sd of {words_of(name)} is {sd * scale:.2g} {unit}; the limit is {limit * scale:.2g} {unit}."
+    )
+    return f"{told} {motion}"
+
+
+def limit_of(one: HistoryUnit, name: Name) -> tuple[float | None, float, str]:
+    """(largest sd, of a gain relative, of a zero in its calibrated unit; that in the shown unit; the shown unit)."""
+    p = Parameters()
+    if name[1] == "gain":
+        return (p.gyro_max_scale_sd if name[0] == Sensor.GYROSCOPE else p.ellipsoid_max_scale_sd), 100.0, "%"
+    if name[1] != "zero":
+        return None, 1.0, ""
+    if name[0] == Sensor.GYROSCOPE:
+        return INFORMED_SHARE * float(np.radians(p.prior_gyroscope_zero_dps)), float(np.degrees(1.0)), "deg/s"
+    if name[0] == Sensor.ACCELEROMETER:
+        return INFORMED_SHARE * p.prior_accelerometer_zero_mps2, 1.0, "m/s^2"
+    calibrated = _unit(one, (name[0], "gain", name[2])).split("/")[0] if (name[0], "gain", name[2]) in one.units else ""
+    calibrated = one.units[name] if calibrated == "1" else calibrated
+    field = FIELD_T / UNIT_IN_TESLA[calibrated] if calibrated in UNIT_IN_TESLA else 1.0
+    return INFORMED_SHARE * p.prior_magnetometer_zero * field, 1.0, calibrated
+
+
+def words_of(name: Name) -> str:
+    """A constant in words."""
+    parameter = "scale" if name[1] == "gain" else name[1].replace("_", " ")
+    return f"the {name[0]}'s {name[2]} {parameter}".replace("  ", " ")
+
+
+def _sentence(found: Pooled, place: int, shares: Array, left_out: list[str]) -> str:
+    """What the value is from."""
+    flights = int(np.sum(shares > 0.0))
+    sessions = len({flight.session for k, flight in enumerate(found.unit.flights) if shares[k] > 0.0})
+    text = f"What {flights} flights in {sessions} sessions know together."
+    if left_out:
+        text += f" {len(left_out)} that contradict the others are left out."
+    for step in found.steps:
+        if step.name == found.names[place]:
+            text += f" It stepped by {abs(step.z):.0f} sd; earlier flights tell no more of it."
+    return text
+
+
+def _moment(day: float, one: HistoryUnit) -> datetime | None:
+    if one.last["started_at"] is None:
+        return None
+    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=round(float(day) * 86_400_000_000))

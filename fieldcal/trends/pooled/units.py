@@ -1,0 +1,153 @@
+"""From the table `information` to units whose flights can be pooled: in coordinates that siblings share, in order of
+time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from fieldcal.estimation.normal_equations import Name, NormalEquations
+from fieldcal.estimation.pooled.unit import Flight, Unit
+from fieldcal.geometry.rotation import Array
+from fieldcal.names import Status
+from fieldcal.schemas.columns import FLOWN_ORDER
+from fieldcal.schemas.reference import PLAUSIBLE_DEGC, REFERENCE_DEGC
+from fieldcal.stages.joint.information import equations_of
+
+DAY_US = 86_400_000_000
+FEWEST_FLIGHTS = 2
+LEAST_OFTEN = 0.5
+"""Share of its flights that a parameter beside gain and zero has to be in: what only some have is eliminated."""
+BY_GAIN = ("gain", "zero", "zero_per_degc", "g_sensitivity")
+"""Parameters in logged units: over the axis' usual gain they are what siblings of any unit share."""
+USUAL = ("gain", "zero", "zero_per_degc")
+
+
+@dataclass(frozen=True)
+class HistoryUnit:
+    """A unit of the history: `unit` as it is pooled, `flight_ids` in its order, `last` the lead of its last flight and
+    `sensor_unit_ids` of its sensors; `per` of each constant: its value in the history over that in the unit; `units` of
+    each constant in the history; `temperatures_degc` flown, (lowest, highest) or None."""
+
+    unit: Unit
+    flight_ids: tuple[str, ...]
+    pooled_with: str
+    last: Mapping[str, object]
+    sensor_unit_ids: Mapping[str, str]
+    per: Mapping[Name, float]
+    units: Mapping[Name, str]
+    temperatures_degc: tuple[float, float] | None
+
+
+def units_of_history(rows: pl.DataFrame) -> Iterator[HistoryUnit]:
+    """Units with flights enough of `information`'s rows, in order of their ids."""
+    for _, own in rows.sort("unit_id", *FLOWN_ORDER, "place", nulls_last=False).group_by(
+        "unit_id", maintain_order=True
+    ):
+        dated = own.filter(pl.col("started_at").is_not_null())
+        unit = _unit(dated if dated.height else own)
+        if unit is not None:
+            yield unit
+
+
+def _unit(rows: pl.DataFrame) -> HistoryUnit | None:
+    flights = rows.partition_by("flight_id", maintain_order=True)
+    if len(flights) < FEWEST_FLIGHTS:
+        return None
+    # A sensor is that of the last flight: one of another id, or logged in another unit, is eliminated.
+    now = rows.group_by("sensor", maintain_order=True).agg(
+        pl.col("sensor_unit_id").last(), zero_unit=pl.col("unit").filter(pl.col("parameter") == "zero").last()
+    )
+    ids = dict(now.select("sensor", "sensor_unit_id").iter_rows())
+    zero_units = dict(now.select("sensor", "zero_unit").iter_rows())
+    usable = [_usable(one, ids, zero_units) for one in flights]
+    often = _often(usable)
+    usable = [one.of([name for name in one.names if name in often]) for one in usable]
+    gains = _usual_gains(usable)
+    sessions, day = _sessions(rows, flights)
+    made = []
+    for one, own, session in zip(usable, flights, sessions, strict=True):
+        factor = np.array([1.0 / gains[name[0], name[2][:1]] if name[1] in BY_GAIN else 1.0 for name in one.names])
+        made.append(
+            Flight(
+                one.as_function(one.names, one.reference * factor, np.diag(factor)) if len(one.names) else one,
+                session,
+                _warmth(own),
+            )
+        )
+    unit = Unit(tuple(made), day)
+    units = {(s, p, a): u for s, p, a, u in rows.select("sensor", "parameter", "axis", "unit").iter_rows()}
+    warm = [f.warmth_degc + REFERENCE_DEGC for f in made if f.warmth_degc is not None]
+    return HistoryUnit(
+        unit=unit,
+        flight_ids=tuple(str(own["flight_id"][0]) for own in flights),
+        pooled_with=str(rows["unit_id"][0]),
+        last=flights[-1].row(0, named=True),
+        sensor_unit_ids=ids,
+        per={name: gains[name[0], name[2][:1]] if name[1] in BY_GAIN else 1.0 for name in unit.names},
+        units=units,
+        temperatures_degc=(min(warm), max(warm)) if warm else None,
+    )
+
+
+def _usable(rows: pl.DataFrame, ids: Mapping[str, str], zero_units: Mapping[str, str]) -> NormalEquations:
+    """A flight's equations of what counts: neither refused nor withdrawn, of the sensors that there are now."""
+    found = equations_of(rows)
+    unit_of_zero = pl.col("unit").filter(pl.col("parameter") == "zero").first().over("sensor")
+    counts = rows.filter(
+        (pl.col("status") == Status.OK)
+        & (pl.col("sensor_unit_id") == pl.col("sensor").replace_strict(ids))
+        & (unit_of_zero == pl.col("sensor").replace_strict(zero_units))
+    )
+    return found.of(list(counts.select("sensor", "parameter", "axis").iter_rows()))
+
+
+def _often(flights: list[NormalEquations]) -> set[Name]:
+    count: dict[Name, int] = {}
+    for one in flights:
+        for name in one.names:
+            count[name] = count.get(name, 0) + 1
+    return {
+        name for name, n in count.items() if name[1] in USUAL or n >= max(FEWEST_FLIGHTS, LEAST_OFTEN * len(flights))
+    }
+
+
+def _usual_gains(flights: list[NormalEquations]) -> dict[tuple[str, str], float]:
+    """By sensor and axis, > 0."""
+    gains: dict[tuple[str, str], list[float]] = {}
+    for one in flights:
+        for name, value in zip(one.names, one.reference, strict=True):
+            if name[1] == "gain":
+                gains.setdefault((name[0], name[2]), []).append(abs(float(value)))
+    usual = {key: float(np.median(values)) for key, values in gains.items()}
+    # A zero may be known where its gain was refused in every flight.
+    others = {(name[0], name[2][:1]) for one in flights for name in one.names if name[1] in BY_GAIN} - usual.keys()
+    return usual | {key: _gain_beside(key, usual) for key in others}
+
+
+def _gain_beside(key: tuple[str, str], usual: Mapping[tuple[str, str], float]) -> float:
+    of_sensor = [value for (sensor, _), value in usual.items() if sensor == key[0]]
+    return float(np.median(of_sensor)) if of_sensor else 1.0
+
+
+def _sessions(rows: pl.DataFrame, flights: list[pl.DataFrame]) -> tuple[list[int], Array]:
+    """(session of each flight, day of each session): numbered in order of time; a day apart where nobody knows when."""
+    labels = [(one["vehicle_id"][0], one["session_id"][0]) for one in flights]
+    times = [None if (at := one["started_at"].dt.timestamp("us")[0]) is None else at / DAY_US for one in flights]
+    order = {label: k for k, label in enumerate(dict.fromkeys(labels))}
+    if times[0] is None:
+        return [order[label] for label in labels], np.arange(float(len(order)))
+    known = [time for time in times if time is not None]
+    mean = {label: np.mean([t for t, own in zip(known, labels, strict=True) if own == label]) for label in order}
+    ascending = sorted(order, key=lambda label: (mean[label], order[label]))
+    place = {label: k for k, label in enumerate(ascending)}
+    return [place[label] for label in labels], np.array([float(mean[label]) for label in ascending])
+
+
+def _warmth(rows: pl.DataFrame) -> float | None:
+    degc = rows["temperature_degc"][0]
+    low, high = PLAUSIBLE_DEGC
+    return float(degc) - REFERENCE_DEGC if degc is not None and low <= degc <= high else None

@@ -1,0 +1,150 @@
+"""Units drawn with known truth: steps, spoiled flights, how much constants move."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pooled import NAMES, SCATTER, Truth, alarms, drawn, of_names
+
+from fieldcal.estimation.normal_equations import NormalEquations
+from fieldcal.estimation.pooled.chain import Known
+from fieldcal.estimation.pooled.strengths import Series, Strengths, innovations, strengths_of
+from fieldcal.estimation.pooled.unit import Flight, Kinds, Unit, contradiction, pool
+
+SESSIONS = 12
+KNOWN: Kinds = {
+    kind: Strengths((0.05 * sd) ** 2, sd**2, (1e-4 if kind != ("accelerometer", "zero") else 2e-3) ** 2)
+    for kind, sd in SCATTER.items()
+}
+
+
+def ratios(units: int, seen: int) -> np.ndarray:
+    out = []
+    for seed in range(units):
+        rng = np.random.default_rng([5, seed])
+        unit = drawn(rng, SESSIONS, seen=seen)
+        truth = Truth(np.random.default_rng([5, seed]), SESSIONS).walked[-1]
+        found = pool(unit, KNOWN)
+        assert not found.steps
+        assert not found.left_out
+        now, order = found.at(), [NAMES.index(name) for name in found.names]
+        out.append((now.state[:18] - truth[order]) / np.sqrt(np.diagonal(now.covariance)[:18]))
+    return np.array(out)
+
+
+@pytest.mark.parametrize("seen", [4, 12])
+def test_errors_are_as_large_as_claimed(seen: int) -> None:
+    """Flights of four combinations of 18 constants among them."""
+    z = ratios(12, seen)
+    assert 0.85 < np.sqrt(np.mean(z**2)) < 1.15
+    assert np.abs(z).max() < 4.5
+
+
+def test_a_step_of_ten_scatters_is_found_in_its_session_and_named() -> None:
+    for place in (0, 4, 9, 17):
+        found = pool(drawn(np.random.default_rng(place), SESSIONS, seen=12, step=(7, place, 10.0)), KNOWN)
+        assert [(step.name, step.after) for step in found.steps] == [(NAMES[place], 7)]
+        size = 10.0 * SCATTER[NAMES[place][:2]]
+        assert abs(found.steps[0].size - size) < 5.0 * found.steps[0].sd
+        assert not found.left_out
+
+
+def spoiled(unit: Unit, flight: int) -> Unit:
+    """One flight whose accelerometer reads as if x and z were off by twenty scatters."""
+    own = unit.flights[flight].equations
+    moved = own.information @ (20.0 * of_names(SCATTER) * np.isin(np.arange(18), (0, 5)))
+    flights = list(unit.flights)
+    flights[flight] = replace(flights[flight], equations=replace(own, right=own.right + moved))
+    return replace(unit, flights=tuple(flights))
+
+
+@pytest.mark.parametrize("flight", [0, 5, SESSIONS - 1])
+def test_a_spoiled_flight_is_left_out(flight: int) -> None:
+    unit = drawn(np.random.default_rng(2), SESSIONS, seen=12)
+    found = pool(spoiled(unit, flight), KNOWN)
+    assert [one.flight for one in found.left_out] == [flight]
+    assert not found.steps
+    clean = pool(unit, KNOWN)
+    difference = (found.at().state - clean.at().state)[:18] / np.sqrt(np.diagonal(found.at().covariance)[:18])
+    assert np.abs(difference).max() < 2.0, "as if it had not been flown"
+    assert not found.contributions()[flight].any()
+
+
+def test_a_parallel_shift_of_the_reference_point_changes_nothing() -> None:
+    unit = drawn(np.random.default_rng(3), SESSIONS, seen=4)
+    moved = [
+        replace(flight, equations=flight.equations.moved(flight.equations.reference + 0.01 * (k - 5)))
+        for k, flight in enumerate(unit.flights)
+    ]
+    one, other = (pool(u, KNOWN).at() for u in (unit, replace(unit, flights=tuple(moved))))
+    np.testing.assert_allclose(one.state, other.state, rtol=1e-6, atol=1e-9)
+
+
+def test_a_slope_within_a_flight_is_one_of_the_constant() -> None:
+    """A flight that warmed up says how the zero follows the temperature, and nothing of the zero itself."""
+    names = (("gyroscope", "zero", "x"), ("gyroscope", "zero_per_degc", "x"))
+    flights = tuple(
+        Flight(NormalEquations(names, np.array([z, 1e-3]), np.zeros(2), np.diag([1e6, 1e10])), k, 0.0)
+        for k, z in enumerate((0.01, 0.0101, 0.0099))
+    )
+    kinds = {("gyroscope", "zero"): Strengths(0.0, 1e-8, 1e-2)}
+    now = pool(Unit(flights, np.arange(3.0)), kinds).at()
+    assert now.state[1] == pytest.approx(1e-3, rel=1e-6)
+    assert now.covariance[1, 1] == pytest.approx(1.0 / 3e10, rel=1e-3)
+
+
+def test_what_is_not_known_by_both_cannot_contradict() -> None:
+    own = Known(np.diag([1.0, 0.0]), np.array([100.0, 0.0]))
+    assert contradiction(own, Known(np.diag([0.0, 5.0]), np.zeros(2))) == (0.0, 0)
+    chi2, count = contradiction(own, Known(np.diag([4.0, 5.0]), np.zeros(2)))
+    assert count == 1
+    assert chi2 == pytest.approx(100.0**2 / (1.0 + 0.25), rel=1e-3)
+
+
+def drawn_series(rng: np.random.Generator, strengths: Strengths, own_sd: float, series: int, sessions: int) -> Series:
+    rows = []
+    for _ in range(series):
+        day, warmth = np.cumsum(rng.uniform(1.0, 9.0, sessions)), rng.uniform(-20.0, 10.0, sessions)
+        walk = np.cumsum(rng.normal(size=sessions) * np.sqrt(strengths.walk * np.diff(day, prepend=day[0])))
+        value = 5.0 + walk + np.sqrt(strengths.slope) * rng.normal() * warmth
+        value += np.sqrt(strengths.scatter + own_sd**2) * rng.normal(size=sessions)
+        rows.append(np.column_stack([day, warmth, value, np.full(sessions, own_sd**2)]))
+    return Series.of(rows)
+
+
+def test_strengths_are_found_where_there_is_enough_to_tell() -> None:
+    true = Strengths(1e-3, 0.5, 4e-4)
+    found = strengths_of(drawn_series(np.random.default_rng(1), true, 0.5, 60, 24))
+    for name in ("walk", "scatter", "slope"):
+        assert 0.6 < getattr(found, name) / getattr(true, name) < 1.7, name
+    assert found.freedom > 60 * 20
+
+
+def test_innovations_of_the_right_strengths_are_white() -> None:
+    true = Strengths(1e-3, 0.5, 4e-4)
+    z, _ = innovations(drawn_series(np.random.default_rng(2), true, 0.5, 60, 24), true)
+    assert np.isnan(z[0]).all()
+    assert np.nanmean(z**2) == pytest.approx(1.0, abs=0.1)
+    assert np.nanmean(z[1:-1] * z[2:]) == pytest.approx(0.0, abs=0.1)
+
+
+def test_a_step_does_not_pass_for_a_walk() -> None:
+    series = drawn_series(np.random.default_rng(3), Strengths(0.0, 0.5, 0.0), 0.5, 30, 20)
+    value = series.value.copy()
+    value[10:, 0] += 50.0
+    one, other = (strengths_of(s, with_slope=False) for s in (series, replace(series, value=value)))
+    assert other.walk == pytest.approx(one.walk, rel=1.0)
+    assert other.scatter == pytest.approx(one.scatter, rel=0.2)
+
+
+def test_of_single_sessions_the_scatter_is_half_of_their_own_sd() -> None:
+    found = strengths_of(drawn_series(np.random.default_rng(4), Strengths(0.0, 0.0, 0.0), 2.0, 5, 1))
+    assert (found.walk, found.scatter) == (0.0, pytest.approx(1.0))
+
+
+def test_units_without_a_fault_are_told_of_none() -> None:
+    """A thinned run of `benchmarks/pooled.py alarms`."""
+    ((wrong, _, hits),) = alarms(1, counts=(8,)).values()
+    assert (wrong, hits) == (0, 1)
