@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import polars as pl
@@ -15,9 +16,10 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import Status
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import PLAUSIBLE_DEGC, REFERENCE_DEGC
-from fieldcal.stages.joint.information import equations_of
+from fieldcal.schemas.rows import InformationRow
+from fieldcal.words.rows import typed
 
-DAY_US = 86_400_000_000
+EPOCH, DAY = datetime(1970, 1, 1, tzinfo=UTC), timedelta(days=1)
 FEWEST_FLIGHTS = 2
 LEAST_OFTEN = 0.5
 """Share of its flights that a parameter beside gain and zero has to be in: what only some have is eliminated."""
@@ -54,20 +56,20 @@ def units_of_history(rows: pl.DataFrame) -> Iterator[HistoryUnit]:
 
 
 def _unit(rows: pl.DataFrame) -> HistoryUnit | None:
-    flights = rows.partition_by("flight_id", maintain_order=True)
+    grouped: dict[str, list[InformationRow]] = {}
+    for row in typed(rows.iter_rows(named=True), InformationRow):
+        grouped.setdefault(row["flight_id"], []).append(row)
+    flights = list(grouped.values())
     if len(flights) < FEWEST_FLIGHTS:
         return None
     # A sensor is that of the last flight: one of another id, or logged in another unit, is eliminated.
-    now = rows.group_by("sensor", maintain_order=True).agg(
-        pl.col("sensor_unit_id").last(), zero_unit=pl.col("unit").filter(pl.col("parameter") == "zero").last()
-    )
-    ids = dict(now.select("sensor", "sensor_unit_id").iter_rows())
-    zero_units = dict(now.select("sensor", "zero_unit").iter_rows())
-    usable = [_usable(one, ids, zero_units) for one in flights]
+    ids = {row["sensor"]: row["sensor_unit_id"] for own in flights for row in own}
+    zero_units = {row["sensor"]: row["unit"] for own in flights for row in own if row["parameter"] == "zero"}
+    usable = [_usable(own, ids, zero_units) for own in flights]
     often = _often(usable)
     usable = [one.of([name for name in one.names if name in often]) for one in usable]
     gains = _usual_gains(usable)
-    sessions, day = _sessions(rows, flights)
+    sessions, day = _sessions(flights)
     made = []
     for one, own, session in zip(usable, flights, sessions, strict=True):
         factor = np.array([1.0 / gains[name[0], name[2][:1]] if name[1] in BY_GAIN else 1.0 for name in one.names])
@@ -79,13 +81,13 @@ def _unit(rows: pl.DataFrame) -> HistoryUnit | None:
             )
         )
     unit = Unit(tuple(made), day)
-    units = {(s, p, a): u for s, p, a, u in rows.select("sensor", "parameter", "axis", "unit").iter_rows()}
+    units = {(row["sensor"], row["parameter"], row["axis"]): row["unit"] for own in flights for row in own}
     warm = [f.warmth_degc + REFERENCE_DEGC for f in made if f.warmth_degc is not None]
     return HistoryUnit(
         unit=unit,
-        flight_ids=tuple(str(own["flight_id"][0]) for own in flights),
-        pooled_with=str(rows["unit_id"][0]),
-        last=flights[-1].row(0, named=True),
+        flight_ids=tuple(grouped),
+        pooled_with=flights[-1][0]["unit_id"],
+        last=flights[-1][0],
         sensor_unit_ids=ids,
         per={name: gains[name[0], name[2][:1]] if name[1] in BY_GAIN else 1.0 for name in unit.names},
         units=units,
@@ -93,16 +95,24 @@ def _unit(rows: pl.DataFrame) -> HistoryUnit | None:
     )
 
 
-def _usable(rows: pl.DataFrame, ids: Mapping[str, str], zero_units: Mapping[str, str]) -> NormalEquations:
+def _usable(rows: list[InformationRow], ids: Mapping[str, str], zero_units: Mapping[str, str]) -> NormalEquations:
     """A flight's equations of what counts: neither refused nor withdrawn, of the sensors that there are now."""
-    found = equations_of(rows)
-    unit_of_zero = pl.col("unit").filter(pl.col("parameter") == "zero").first().over("sensor")
-    counts = rows.filter(
-        (pl.col("status") == Status.OK)
-        & (pl.col("sensor_unit_id") == pl.col("sensor").replace_strict(ids))
-        & (unit_of_zero == pl.col("sensor").replace_strict(zero_units))
-    )
-    return found.of(list(counts.select("sensor", "parameter", "axis").iter_rows()))
+    p = len(rows)
+    lower = np.zeros((p, p))
+    for place, row in enumerate(rows):
+        lower[place, : place + 1] = row["information"]
+    names = tuple((row["sensor"], row["parameter"], row["axis"]) for row in rows)
+    reference, right = (np.array([row[column] for row in rows]) for column in ("linearised_at", "right_side"))
+    found = NormalEquations(names, reference, right, lower + np.tril(lower, -1).T)
+    of_zero = {row["sensor"]: row["unit"] for row in rows if row["parameter"] == "zero"}
+    counts = [
+        name
+        for name, row in zip(names, rows, strict=True)
+        if row["status"] == Status.OK
+        and row["sensor_unit_id"] == ids[name[0]]
+        and of_zero.get(name[0]) == zero_units.get(name[0])
+    ]
+    return found if len(counts) == p else found.of(counts)
 
 
 def _often(flights: list[NormalEquations]) -> set[Name]:
@@ -133,10 +143,10 @@ def _gain_beside(key: tuple[str, str], usual: Mapping[tuple[str, str], float]) -
     return float(np.median(of_sensor)) if of_sensor else 1.0
 
 
-def _sessions(rows: pl.DataFrame, flights: list[pl.DataFrame]) -> tuple[list[int], Array]:
+def _sessions(flights: list[list[InformationRow]]) -> tuple[list[int], Array]:
     """(session of each flight, day of each session): numbered in order of time; a day apart where nobody knows when."""
-    labels = [(one["vehicle_id"][0], one["session_id"][0]) for one in flights]
-    times = [None if (at := one["started_at"].dt.timestamp("us")[0]) is None else at / DAY_US for one in flights]
+    labels = [(one[0]["vehicle_id"], one[0]["session_id"]) for one in flights]
+    times = [None if (at := one[0]["started_at"]) is None else (at - EPOCH) / DAY for one in flights]
     order = {label: k for k, label in enumerate(dict.fromkeys(labels))}
     if times[0] is None:
         return [order[label] for label in labels], np.arange(float(len(order)))
@@ -147,7 +157,7 @@ def _sessions(rows: pl.DataFrame, flights: list[pl.DataFrame]) -> tuple[list[int
     return [place[label] for label in labels], np.array([float(mean[label]) for label in ascending])
 
 
-def _warmth(rows: pl.DataFrame) -> float | None:
-    degc = rows["temperature_degc"][0]
+def _warmth(rows: list[InformationRow]) -> float | None:
+    degc = rows[0]["temperature_degc"]
     low, high = PLAUSIBLE_DEGC
     return float(degc) - REFERENCE_DEGC if degc is not None and low <= degc <= high else None
