@@ -60,7 +60,7 @@ def demo(folder: Path = Path("fieldcal-demo"), /, *, warehouse: Root = None, con
     folder
         Where logs and results go.
     """
-    from fieldcal.cli.demo import run_demo
+    from fieldcal.cli.present.demo import run_demo
 
     return LOSSES if run_demo(folder, warehouse or folder / "fieldcal-data", config) else OK
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import fieldcal
-from fieldcal.cli.demo import beside_truth
+from fieldcal.cli.present.demo import beside_truth
 from fieldcal.names import SENSORS
 from fieldcal.schemas.rows import CalibrationRow
 from fieldcal.simulation.archive import Truth
