@@ -22,6 +22,7 @@ from fieldcal.cli.prune import prune
 from fieldcal.cli.report import report as report_command
 from fieldcal.cli.serve import serve, trigger
 from fieldcal.cli.simulate import simulate
+from fieldcal.cli.site import site
 from fieldcal.names import Verdict
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.words.printable import printable
@@ -416,6 +417,7 @@ app.command(inspect)
 app.command(init)
 app.command(config_app)
 app.command(report_command, name="report")
+app.command(site)
 app.command(serve)
 app.command(trigger)
 app.command(prune)
