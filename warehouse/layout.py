@@ -22,6 +22,8 @@ _EMPTY = "__HIVE_DEFAULT_PARTITION__"
 _LONGEST = 150
 _CUT = 100
 _PARTITION = "vehicle_id="
+SITE = "site"
+"""Folder of the pages below the data root; `night/site` remembers what they were made from."""
 
 
 def encode_id(text: str) -> str:

@@ -264,7 +264,7 @@ def _parameters(
         .sort(FLOWN_ORDER, nulls_last=False)
         .collect()
     )
-    panels = max(3 * len(units), rows.select("unit_id", "axis").unique().height)
+    panels = max(3 * len(units), 1, rows.select("unit_id", "axis").unique().height)
     most = max(FEWEST_POINTS, 3 * MOST_POINTS // panels)
     sections: list[Section] = []
     for sensor in sorted(rows["sensor"].unique().to_list(), key=lambda name: _place(SENSORS, name)):

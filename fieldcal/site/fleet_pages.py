@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from datetime import datetime
 
 import polars as pl
 from markupsafe import Markup
@@ -85,12 +86,21 @@ def _row(
         links.to(vehicle_name(one.vehicle_id), one.vehicle_id),
         badge(one.standing),
         why or "–",
-        "none" if last is None else links.to(flight_name(last["flight_id"]), day(last["started_at"])),
+        "none" if last is None else Markup("{}{}").format(_linked(last, links), _ago(last["started_at"])),
         str(flights.height),
         str(latest["imu_id"]),
         text,
         drawn,
     ]
+
+
+def _linked(flight: UsableFlight, links: Links) -> str | Markup:
+    return links.to(flight_name(flight["flight_id"]), day(flight["started_at"]))
+
+
+def _ago(moment: datetime | None) -> Markup:
+    """Where a script says how long ago that was, by the reader's clock: a page is as old as its night."""
+    return Markup(' <time class="note" datetime="{}"></time>').format(moment.isoformat()) if moment else Markup("")
 
 
 def flights_page(links: Links) -> Page:

@@ -9,8 +9,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
 
-import polars as pl
-
 from fieldcal.names import Json
 from fieldcal.report.fitness import Fitness
 from fieldcal.schemas import HISTORY_TABLES
@@ -19,7 +17,7 @@ from fieldcal.site.pages import DATA
 from fieldcal.site.snapshot import Snapshot
 from fieldcal.warehouse.errors import disk
 from fieldcal.warehouse.files import write_bytes
-from fieldcal.warehouse.layout import encode_id
+from fieldcal.warehouse.layout import SITE, checksum_path, encode_id, history_path
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 
 FOLDERS = ("", DATA, CONSTANTS)
@@ -119,30 +117,24 @@ class Written:
 
 def folder(root: Path) -> Path:
     """Where nights remember what of the site they wrote."""
-    return root / "night" / "site"
+    return root / "night" / SITE
 
 
 def vehicle_digest(snapshot: Snapshot, one: Fitness, code: str) -> str:
-    """Digest of all that a vehicle's pages, its flights' too, show."""
-    own = {table: snapshot.scan(table, vehicle_id=one.vehicle_id).collect() for table in HISTORY_TABLES}
-    units = own["calibration"]["unit_id"].unique().to_list()
-    elsewhere = {
-        table: snapshot.scan(table).filter(pl.col("unit_id").is_in(units), pl.col("vehicle_id") != one.vehicle_id)
-        for table in ("calibration", "drift")
-    }
-    told = [code, one.standing, *one.reasons, *map(_rows, own.values())]
-    return _joined([*told, *(_rows(rows.collect()) for rows in elsewhere.values())])
+    """Digest of all that a vehicle's pages, its flights' too, show: by the records of what its history holds, and of
+    that of others that carried its units."""
+    told = [code, one.standing, *one.reasons]
+    for vehicle_id in snapshot.sharing_units(one.vehicle_id):
+        for table in HISTORY_TABLES:
+            record = checksum_path(snapshot.root, history_path(snapshot.root, table, vehicle_id))
+            told.append(f"{table} {record.read_bytes().hex() if record.exists() else None}")
+    return _joined(told)
 
 
 def flight_digest(snapshot: Snapshot, vehicle_id: str, flight_id: str, code: str) -> str:
     """Digest of all that a flight's page shows."""
     rows = (snapshot.scan(table, flight_id=flight_id).collect() for table in OF_FLIGHT)
-    return _joined([code, vehicle_id, *map(_rows, rows)])
-
-
-def _rows(rows: pl.DataFrame) -> str:
-    """Rows as one text: equal for equal rows in equal order."""
-    return f"{rows.columns}{rows.rows()}"
+    return _joined([code, vehicle_id, *(f"{of.columns}{of.rows()}" for of in rows)])
 
 
 def _joined(texts: list[str]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
@@ -48,6 +49,16 @@ class Snapshot(Warehouse):
         if key not in self._answers:
             self._answers[key] = super().sql(query, parameters, **limits)
         return self._answers[key]
+
+    def sharing_units(self, vehicle_id: str) -> list[str]:
+        """The vehicle and those others that carried any of its units."""
+        return sorted({vehicle_id, *self._sharing.get(vehicle_id, ())})
+
+    @cached_property
+    def _sharing(self) -> dict[str, list[str]]:
+        carried = self._whole("calibration").select("vehicle_id", "unit_id").unique()
+        both = carried.join(carried, on="unit_id", suffix="_other").select("vehicle_id", "vehicle_id_other").unique()
+        return {str(own): rows["vehicle_id_other"].to_list() for (own,), rows in both.group_by("vehicle_id")}
 
     def _whole(self, table: str) -> pl.DataFrame:
         if table not in self._tables:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from urllib.parse import quote
 
 import polars as pl
 
+from fieldcal.errors import FieldcalError
 from fieldcal.names import Json
 from fieldcal.report.fitness import Fitness
 from fieldcal.report.flight import flight_page
 from fieldcal.report.flight_data import read_flight
 from fieldcal.report.links import Links, flight_name, vehicle_name
-from fieldcal.report.page import Page, link
+from fieldcal.report.page import Notice, Page, Section, link
 from fieldcal.report.vehicle import vehicle_page
 from fieldcal.site.charts import Charts
 from fieldcal.site.downloads import constants_files, figures_file
@@ -22,12 +24,37 @@ from fieldcal.site.script_data import script, shown
 from fieldcal.site.snapshot import Snapshot
 from fieldcal.site.vehicle_charts import on_site
 from fieldcal.warehouse.questions import units_flown
+from fieldcal.words.talk import say
 
 SCRIPTS = ("site.js", "charts.js")
 
 
 def vehicle_files(snapshot: Snapshot, one: Fitness, links: Links) -> dict[str, bytes]:
     """By their names below the site."""
+    title, name = f"Vehicle {one.vehicle_id}", vehicle_name(one.vehicle_id)
+    return _made(lambda: _vehicle(snapshot, one, links), title, name, links)
+
+
+def flight_files(snapshot: Snapshot, vehicle_id: str, flight_id: str, links: Links) -> dict[str, bytes]:
+    """By their names below the site."""
+    title, name = f"Flight {flight_id} of {vehicle_id}", flight_name(flight_id)
+    return _made(lambda: _flight(snapshot, vehicle_id, flight_id, links), title, name, links)
+
+
+def _made(make: Callable[[], dict[str, bytes]], title: str, name: str, links: Links) -> dict[str, bytes]:
+    """What is made; where a mistake of ours keeps a page from being made, a page that says so: nights go on."""
+    try:
+        return make()
+    except FieldcalError:
+        raise
+    except Exception as error:
+        told = f"This page could not be made ({type(error).__name__}: {error}). The history itself is whole."
+        say(f"{title}: {told}")
+        page = Page(title, [], [], [Section("failed", "Not made", [Notice(told)])], FOOTER, links.up())
+        return _files(name.removesuffix(".html"), page, Charts(), [])
+
+
+def _vehicle(snapshot: Snapshot, one: Fitness, links: Links) -> dict[str, bytes]:
     stem = vehicle_name(one.vehicle_id).removesuffix(".html")
     charts = Charts()
     page = vehicle_page(snapshot.root, one.vehicle_id, links, None, snapshot, on_site(charts))
@@ -48,8 +75,7 @@ def vehicle_files(snapshot: Snapshot, one: Fitness, links: Links) -> dict[str, b
     return files | _files(stem, whole, charts, told)
 
 
-def flight_files(snapshot: Snapshot, vehicle_id: str, flight_id: str, links: Links) -> dict[str, bytes]:
-    """By their names below the site."""
+def _flight(snapshot: Snapshot, vehicle_id: str, flight_id: str, links: Links) -> dict[str, bytes]:
     stem = flight_name(flight_id).removesuffix(".html")
     charts = Charts()
     runs = snapshot.scan("run", vehicle_id=vehicle_id, flight_id=flight_id).filter("is_primary").collect()

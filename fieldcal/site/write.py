@@ -16,10 +16,9 @@ from fieldcal.site.pages import ASSETS, DATA, Frame, asset, html
 from fieldcal.site.script_data import script
 from fieldcal.site.snapshot import Snapshot
 from fieldcal.site.vehicle_pages import flight_files, vehicle_files
-from fieldcal.warehouse.layout import prepare
+from fieldcal.warehouse.layout import SITE, prepare
 from fieldcal.warehouse.questions import existing
 
-SITE = "site"
 INDEX = "index.html"
 ALWAYS = f"{DATA}/fleet.js"
 

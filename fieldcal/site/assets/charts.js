@@ -123,8 +123,8 @@
   const seriesOf = (panel, curve, i) => {
     const stroke = () => colour(ink(panel, i));
     const point = { show: true, size: 6, stroke, fill: curve.kind === "open" ? () => colour("bg") : stroke };
-    if (curve.kind === "line") return { stroke, width: 1, points: { show: false } };
-    if (curve.kind === "trend") return { stroke, width: 1.5, points: { show: false } };
+    if (curve.kind === "line") return { stroke, width: 1, pxAlign: 0, points: { show: false } };
+    if (curve.kind === "trend") return { stroke, width: 1.5, pxAlign: 0, points: { show: false } };
     if (curve.kind === "joined") return { stroke, width: 1, points: point };
     return { stroke, paths: () => null, points: curve.kind === "refused" ? { show: false } : point };
   };
@@ -148,7 +148,7 @@
 
     bar(download) {
       const button = (text, name, act) => {
-        const made = el("button", { type: "button", "aria-label": `${name}: ${this.chart.title}`, title: name }, text);
+        const made = el("button", { type: "button", "aria-label": `${text}, ${name}: ${this.chart.title}`, title: name }, text);
         made.addEventListener("click", act);
         return made;
       };
@@ -219,7 +219,7 @@
       const u = new uPlot(
         {
           width: this.width(),
-          height: view.panels.length > 1 ? (last ? 170 : 140) : 260,
+          height: view.panels.length > 1 ? (last ? 198 : 140) : 260,
           tzDate: (ts) => uPlot.tzDate(new Date(ts * 1e3), "Etc/UTC"),
           legend: { show: false },
           scales: { x: { time: view.time, range: () => this.shown }, y: { range: (own) => yRange(chart, panel, own.scales.x.min ?? -Infinity, own.scales.x.max ?? Infinity) } },

@@ -148,7 +148,7 @@
   const ages = () => {
     for (const time of document.querySelectorAll("time[datetime]")) {
       const days = (Date.now() - Date.parse(time.dateTime)) / 864e5;
-      if (days >= 0) time.after(el("span", { class: "note" }, days < 1 ? " today" : ` ${Math.floor(days)} d ago`));
+      if (days >= 0) time.textContent = days < 1 ? "today" : `${Math.floor(days)} d ago`;
     }
   };
 
