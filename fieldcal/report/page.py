@@ -142,12 +142,12 @@ def html(page: Page) -> str:
 def badge(status: str | None) -> Markup:
     """A status as a coloured word."""
     word = status or "unknown"
-    return Markup('<span class="badge {}">{}</span>').format(STATUS_KIND.get(word, "none"), word)
+    return Markup('<span class="badge {}">{}</span>').format(STATUS_KIND.get(word, "none"), printable(word))
 
 
 def link(href: str, text: str) -> Markup:
     """A link; `href` is a relative address made of encoded ids."""
-    return Markup('<a href="{}">{}</a>').format(href, text)
+    return Markup('<a href="{}">{}</a>').format(href, printable(text))
 
 
 @cache

@@ -23,6 +23,7 @@ import numpy as np
 import polars as pl
 import pytest
 from browser_support import WIDER_THAN_THE_WINDOW, browser, picture, show
+from history_rows import flight
 from report_rows import publish_fleet
 
 from fieldcal.batch.flights import one_flight
@@ -33,12 +34,13 @@ from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.site import write_site
 from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.publish import publish
 
 __all__ = ["browser"]  # a fixture
 
 AXE = Path(__file__).parent / "axe" / "axe.min.js"
 AXE_SHA256 = "29348999450cdf2849a8e70b7912fc2da85a849da39c0d0d5394f51d4a9ed95c"
-FINE = [f"quad-{i:02d}" for i in range(14)]
+FEW = [f"quad-{i:02d}" for i in range(14)]
 SERIOUS = ("serious", "critical")
 WAIT_S = 10.0
 
@@ -61,7 +63,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Vehicles made of rows, and one whose log a night read."""
     folder = tmp_path_factory.mktemp("site")
     root = folder / "data"
-    publish_fleet(root, {"bravo": "step", "charlie": "drifting"} | dict.fromkeys(FINE, "stable"), n_flights=6)
+    publish_fleet(root, {"bravo": "step", "charlie": "drifting"}, n_flights=6)
+    for vehicle in FEW:
+        publish(root, vehicle, flight(vehicle, f"{vehicle}-0"), [f"{vehicle}-0"])
     write_flights(folder / "archive", Experiment(seed=3, duration_s=6.0))
     night = plan_night(folder / "archive", root)
     outcomes = [one_flight(root, job, night.configuration) for job in night.missing()]
@@ -173,19 +177,19 @@ def test_fleet_sorts_searches_and_filters_and_the_address_remembers(browser: Any
     index = f"{site.as_uri()}/index.html"
     show(browser, index)
     every = rows(browser)
-    assert len(every) == len(FINE) + 3
+    assert len(every) == len(FEW) + 3
     assert every[:3] == ["sim-1", "bravo", "charlie"]
     browser.find_element("xpath", "//th/button[text()='vehicle']").click()
     assert rows(browser) == sorted(every)
     browser.find_element("xpath", "//th/button[text()='vehicle']").click()
     assert rows(browser) == sorted(every, reverse=True)
     filled(browser, "Search", "quad-1")
-    assert rows(browser) == sorted(FINE[10:], reverse=True)
-    assert f"{len(FINE) - 10} of {len(every)}" in browser.find_element("css selector", ".controls").text
+    assert rows(browser) == sorted(FEW[10:], reverse=True)
+    assert f"{len(FEW) - 10} of {len(every)}" in browser.find_element("css selector", ".controls").text
     address = browser.current_url
     show(browser, "about:blank")
     show(browser, address)
-    assert rows(browser) == sorted(FINE[10:], reverse=True)
+    assert rows(browser) == sorted(FEW[10:], reverse=True)
     show(browser, "about:blank")
     show(browser, index)
     filled(browser, "standing", "look first")
@@ -194,7 +198,7 @@ def test_fleet_sorts_searches_and_filters_and_the_address_remembers(browser: Any
 
 def test_every_flight_is_found(browser: Any, site: Path, flown: str) -> None:
     show(browser, f"{site.as_uri()}/flights.html")
-    assert len(rows(browser)) == (len(FINE) + 2) * 6 + 1
+    assert len(rows(browser)) == 2 * 6 + len(FEW) + 1
     filled(browser, "Search", "bravo week")
     assert len(rows(browser)) == 6
     filled(browser, "verdict", "partial")
