@@ -10,18 +10,20 @@ from pathlib import Path
 import polars as pl
 
 from fieldcal.config.configuration import Alerts
-from fieldcal.names import GRAVEST_FIRST, SENSORS, DriftStatus, Sensor, Standing, Verdict
+from fieldcal.names import GRAVEST_FIRST, SENSORS, DriftStatus, Sensor, Standing, Status, Verdict
 from fieldcal.report.history import usable_flights
 from fieldcal.report.trend import change_sentence
 from fieldcal.report.words import plain_name
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import UNCONFIRMED_SD
-from fieldcal.schemas.rows import DriftRow, FlightRow
+from fieldcal.schemas.rows import DriftRow, FlightRow, UnfoldedRun
+from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.trends.changes import TELLING, last_usable
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.decisions.withdrawn import counting
 from fieldcal.warehouse.questions import units_flown
-from fieldcal.words.rows import typed
+from fieldcal.words.flights import is_consequence
+from fieldcal.words.rows import typed, unfolded
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,7 @@ def fleet_fitness(
     limit = now - timedelta(days=alerts.expires_days)
     return {
         vehicle: _fitness(
+            warehouse,
             vehicle,
             trends.get(vehicle, nothing),
             latest.get(vehicle, nothing),
@@ -74,6 +77,7 @@ def _by_vehicle(rows: pl.DataFrame) -> dict[str, pl.DataFrame]:
 
 
 def _fitness(
+    warehouse: Warehouse,
     vehicle: str,
     trend: pl.DataFrame,
     flights: pl.DataFrame,
@@ -85,11 +89,12 @@ def _fitness(
 ) -> Fitness:
     last = None if flights.is_empty() else typed([flights.row(-1, named=True)], FlightRow)[0]
     if usable.is_empty():
-        why = None if last is None else last["reason"]
-        counted = "No flight counts." if last is None else "No flight gave a constant."
-        return Fitness(vehicle, Standing.NOTHING, (f"{counted} {why or ''}".strip(),))
+        told = (
+            "No flight counts." if last is None else f"No flight gave a constant. {_why_none(warehouse, last)}".strip()
+        )
+        return Fitness(vehicle, Standing.NOTHING, (told,))
     rows = typed(trend.iter_rows(named=True), DriftRow)
-    reasons = [*_moving(rows), *_of_last(last, usable), *_old(units, ages, limit, alerts)]
+    reasons = [*_moving(rows), *_of_last(warehouse, last, usable), *_old(units, ages, limit, alerts)]
     if reasons:
         return Fitness(vehicle, Standing.LOOK, tuple(dict.fromkeys(reasons)))
     if not rows:
@@ -122,13 +127,29 @@ def _gravity(row: DriftRow) -> tuple[int, str, int, str, str]:
     return order.get(row["status"], len(order)), row["sensor"], telling, row["axis"], row["method"]
 
 
-def _of_last(last: FlightRow | None, usable: pl.DataFrame) -> Iterator[str]:
+def _of_last(warehouse: Warehouse, last: FlightRow | None, usable: pl.DataFrame) -> Iterator[str]:
     if last is None:
         return
     if last["verdict"] != Verdict.OK:
         yield f"Latest log {last['verdict']}: {last['reason'] or last['reason_code']}"
     elif last["flight_id"] not in usable["flight_id"].to_list():
-        yield f"The latest flight gave no constant. {last['reason'] or ''}".strip()
+        yield f"The latest flight gave no constant. {_why_none(warehouse, last)}".strip()
+
+
+def _why_none(warehouse: Warehouse, flight: FlightRow) -> str:
+    """What stopped the first stage of a flight that stopped by itself; nothing where nothing is known."""
+    if flight["reason"]:
+        return str(flight["reason"])
+    ids = {"vehicle_id": flight["vehicle_id"], "flight_id": flight["flight_id"]}
+    rows = warehouse.scan("run", **ids).filter("is_primary").collect()
+    stopped = [
+        row
+        for row in typed(map(unfolded, rows.iter_rows(named=True)), UnfoldedRun)
+        if row["status"] in (Status.REFUSED, Status.FAILED) and not is_consequence(row)
+    ]
+    order = {stage.name: i for i, stage in enumerate(PIPELINE)}
+    first = min(stopped, key=lambda row: order.get(row["stage"], len(order)), default=None)
+    return "" if first is None else str(first["measured"].get("reason") or first["reason_code"])
 
 
 def _old(units: pl.DataFrame, ages: pl.DataFrame, limit: datetime, alerts: Alerts) -> Iterator[str]:
