@@ -134,7 +134,7 @@ def test_a_rejected_log_is_told_and_ends_in_3(capsys: pytest.CaptureFixture[str]
 def test_the_night_as_json(capsys: pytest.CaptureFixture[str], archive: Path, warehouse: Path) -> None:
     found = document(capsys, "nightly", str(archive), "--warehouse", str(warehouse), "--json", code=3)
     counts = {"ok", "partial", "quarantined", "rejected", "stages_run", "stages_cached", "seconds", "logs", "unread"}
-    assert set(found) - counts == {"stage_seconds", "server_seconds", "changes", "report"}
+    assert set(found) - counts == {"stage_seconds", "server_seconds", "changes", "report", "site"}
     assert (found["ok"], found["rejected"], found["stages_run"]) == (1, 1, 0)
     assert {"log_uri", "flight_id", "verdict", "reason_code", "reason"} <= set(found["logs"][0])
     planned = document(
