@@ -160,6 +160,16 @@ class DriftStatus(StrEnum):
     """Too few sessions for a trend."""
 
 
+class Standing(StrEnum):
+    """What is said of a vehicle before it flies, the gravest first."""
+
+    NOTHING = "nothing to fly with"
+    LOOK = "look first"
+    TOO_FEW = "too few to tell"
+    """Its constants are there; whether they hold, too few sessions tell."""
+    FINE = "fine to fly"
+
+
 GRAVEST_FIRST = (
     DriftStatus.STEP,
     DriftStatus.DRIFTING,

@@ -26,6 +26,8 @@ SIGNAL_PARTITION = "vehicle_id="
 PARTITION, FORMER_PARTITION = "vehicle=", "vehicle_id="
 """Of the history, whose files have the column vehicle_id: engines that take a folder's name for a column guess its
 type, and fail where the file has a column of that name and another type. `fieldcal upgrade` renames former folders."""
+SITE = "site"
+"""Folder of the pages below the data root; `night/site` remembers what they were made from."""
 
 
 def encode_id(text: str) -> str:

@@ -151,11 +151,16 @@ def write_table(
 
 def write_frame(rows: pl.DataFrame, path: Path, metadata: Mapping[str, str]) -> None:
     """Write a frame that is no table of the warehouse's, with facts in the file's metadata, atomically."""
+    write_bytes(path, frame_bytes(rows, metadata))
+
+
+def frame_bytes(rows: pl.DataFrame, metadata: Mapping[str, str]) -> bytes:
+    """The bytes `write_frame` would write."""
     data = rows.to_arrow().replace_schema_metadata(dict(metadata))
     buffer = io.BytesIO()
     with pq.ParquetWriter(buffer, data.schema, **_options(data.schema)) as parquet:
         parquet.write_table(data.combine_chunks())
-    write_bytes(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def table_bytes(data: Data, table: str) -> bytes:

@@ -320,6 +320,7 @@ class Warehouse(query.Warehouse):
         from fieldcal.trends.drift_table import update_drift
         from fieldcal.trends.pooled.table import update_pooled
         from fieldcal.warehouse.decisions.decide import decide, flights_meant
+        from fieldcal.warehouse.layout import SITE
         from fieldcal.warehouse.lock import fleet_lock
 
         columns = {"unit_id": part.get("unit"), **{name: part.get(name) for name in ("sensor", "parameter", "axis")}}
@@ -328,6 +329,10 @@ class Warehouse(query.Warehouse):
         n = decide(self.root, flights, decision, reason=reason, author=author or this_user(), part=named)
         with fleet_lock(self.root):
             trends = tuple(sorted({*update_drift(self.root), *update_pooled(self.root)}))
+            if (self.root / SITE).is_dir():  # where nobody made one, none is made
+                from fieldcal.site import write_site
+
+                write_site(self.root)
         return Decided(decision, tuple(flights["flight_id"].to_list()), n, trends)
 
 

@@ -1,4 +1,4 @@
-"""What closes a night, once its flights are published: the fleet's trends, what is new in them, the reports."""
+"""What closes a night, once its flights are published: the fleet's trends, what is new in them, reports, the site."""
 
 from __future__ import annotations
 
@@ -32,17 +32,19 @@ MOST_PAGES = 10
 
 @dataclass
 class Closing:
-    """What is new in the fleet, and where its report is."""
+    """What is new in the fleet, and where its report and its site are."""
 
     changes: list[Change] = field(default_factory=list)
     report: Path | None = None
+    site: Path | None = None
 
 
 def close_night(root: Path, alerts: Alerts) -> Closing:
     """Bring trends and reports up to the history; what is to be told tonight that was not told before.
 
     Trends are regressed only where the history, or the code that makes them, is another than last time. Reports: the
-    fleet's page, and the pages of vehicles of which something is told; `fieldcal report` makes any other.
+    fleet's page, and the pages of vehicles of which something is told; `fieldcal report` makes any other. The site has
+    all of them, and of it only what changed is written.
 
     The history is held against its records first, so that no night ends well over damage that it had no need to read.
 
@@ -76,7 +78,7 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
         made = history_digest(root, FLEET_TABLES)
         record = {"at": now.isoformat(), "made_from": made_from, "made": made, "alerts": limits}
         write_bytes(_place(root), seal(record), durable=False)
-        return Closing(told, _reports(root, told))
+        return Closing(told, _reports(root, told), _site(root, alerts, now))
 
 
 def _reports(root: Path, told: Sequence[Change]) -> Path:
@@ -84,6 +86,12 @@ def _reports(root: Path, told: Sequence[Change]) -> Path:
 
     vehicles = list(dict.fromkeys(change.vehicle_id for change in told if change.kind not in ("expired", "idle")))
     return write_night_reports(root, vehicles[:MOST_PAGES])[0]
+
+
+def _site(root: Path, alerts: Alerts, now: datetime) -> Path:
+    from fieldcal.site import write_site
+
+    return write_site(root, alerts, now=now)
 
 
 def _forget_damaged(root: Path) -> None:

@@ -84,6 +84,7 @@ class NightDocument(NightSummary):
 
     changes: list[PlainChange]
     report: str
+    site: str
     unread: list[UnreadEntry]
     seconds: NotRequired[float]
     server_seconds: NotRequired[float]

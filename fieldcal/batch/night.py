@@ -66,7 +66,8 @@ class Night:
             summary(outcomes, self.plan.done.values(), self.plan.copies, self.plan.copied, self.root)
         )
         unread = [asdict(one) for one in self.plan.unread]
-        return cast(NightDocument, {**told, "changes": changes, "report": str(closing.report), "unread": unread})
+        pages = {"report": str(closing.report), "site": str(closing.site)}
+        return cast(NightDocument, {**told, "changes": changes, **pages, "unread": unread})
 
 
 def plan_night(archive: Path, root: Path, config: Path | None = None, session: Path | None = None) -> Night:

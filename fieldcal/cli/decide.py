@@ -108,6 +108,7 @@ def _told(decided: fieldcal.Decided, done: str, as_json: bool) -> int:
     print(f"{n} flight{'' if n == 1 else 's'} {done}; of {decided.constants} constants it changed whether they count.")
     if trends:
         print(
-            f"Trends were made anew, those of {', '.join(decided.trends)} are others. Pages follow with the next night."
+            f"Trends were made anew, those of {', '.join(decided.trends)} are others."
+            " Reports follow with the next night, the site already has it."
         )
     return 0

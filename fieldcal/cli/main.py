@@ -21,6 +21,7 @@ from fieldcal.cli.onboard import onboard, refit
 from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
 from fieldcal.cli.pooled import plan, pooled
 from fieldcal.cli.report import report as report_command
+from fieldcal.cli.report import site
 from fieldcal.cli.serve import alerts_app, serve, trigger
 from fieldcal.cli.simulate import simulate
 from fieldcal.cli.upkeep import export_warehouse, prune, schemas
@@ -418,6 +419,7 @@ app.command(inspect)
 app.command(init)
 app.command(config_app)
 app.command(report_command, name="report")
+app.command(site)
 app.command(serve)
 app.command(trigger)
 app.command(alerts_app)

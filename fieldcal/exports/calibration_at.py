@@ -20,6 +20,7 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.stages.tables import AXES
+from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.questions import existing, units_flown
 from fieldcal.words.rows import typed
 
@@ -28,7 +29,7 @@ SELECT a.*, l.slope_per_degc, l.slope_per_degc_sd, l.curve_per_degc2, l.curve_pe
     l.temperature_min_degc, l.temperature_max_degc
 FROM calibration_at(?) AS a
 JOIN latest_calibration AS l USING (unit_id, sensor, parameter, axis)
-WHERE a.vehicle_id = ? AND a.parameter IN ('scale', 'zero')
+WHERE a.parameter IN ('scale', 'zero')
 """
 
 
@@ -59,7 +60,11 @@ _CURVE: tuple[_Number, ...] = ("slope_per_degc", "curve_per_degc2", "curve_per_d
 
 
 def constants_of(
-    root: Path, vehicle_id: str, temperature_degc: float | None = None, unit_id: str | None = None
+    root: Path,
+    vehicle_id: str,
+    temperature_degc: float | None = None,
+    unit_id: str | None = None,
+    warehouse: Warehouse | None = None,
 ) -> Constants:
     """Constants at a temperature (default 25 °C) of the primary units that flew last on the vehicle, or of one unit.
 
@@ -73,8 +78,8 @@ def constants_of(
         `no_calibration`: no sensor of the vehicle has all its axes calibrated, or the vehicle is not known.
     """
     at = REFERENCE_DEGC if temperature_degc is None else float(temperature_degc)
-    warehouse = existing(root)
-    rows = warehouse.sql(_QUESTION, [at, vehicle_id])
+    warehouse = warehouse or existing(root)
+    rows = warehouse.sql(_QUESTION, [at]).filter(pl.col("vehicle_id") == vehicle_id)
     units = rows["unit_id"].unique().sort().to_list()
     if rows.is_empty():
         known = warehouse.scan("calibration").select("vehicle_id").unique().sort("vehicle_id").collect()["vehicle_id"]
@@ -103,7 +108,9 @@ def constants_of(
     return replace(constants, further=tuple(one for one in further if one.triads))
 
 
-def what_flies(root: Path, vehicle_id: str, temperature_degc: float | None = None) -> Constants:
+def what_flies(
+    root: Path, vehicle_id: str, temperature_degc: float | None = None, *, warehouse: Warehouse | None = None
+) -> Constants:
     """`constants_of` the units that flew last, with the origin of every sensor, also of those without constants; no
     triads where none has any.
 
@@ -112,11 +119,11 @@ def what_flies(root: Path, vehicle_id: str, temperature_degc: float | None = Non
     FieldcalError
         `no_calibration`: the vehicle is not known.
     """
-    warehouse = existing(root)
+    warehouse = warehouse or existing(root)
     flights = Flights(warehouse, vehicle_id)
     flown = units_flown(warehouse, vehicle_id).rows(named=True)
     try:
-        known = constants_of(root, vehicle_id, temperature_degc)
+        known = constants_of(root, vehicle_id, temperature_degc, warehouse=warehouse)
     except FieldcalError as error:
         if error.reason_code != ReasonCode.NO_CALIBRATION or not flown:
             raise

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 
 import polars as pl
@@ -40,15 +40,15 @@ PRINTED = ("scale", "bias")
 SYMBOLS = {"scale": "λ", "bias": "b", "zero": "zero", "zero_bias": "zero_bias"}
 
 
-def flight_page(data: FlightData, links: Links) -> Page:
-    """The page of one flight."""
+def flight_page(data: FlightData, links: Links, figures: Callable[[FlightData], list[Section]] | None = None) -> Page:
+    """The page of one flight; its `figures` are the paper's, or others."""
     flight = data.flight
     sections = [
         Section("refused", "Refusals and findings", _refusals(data)),
         Section("constants", "Constants (Tables 2–4)", _constants(data.calibration)),
         *([] if data.further.is_empty() else [Section("units", "Further units on board", _further(data.further))]),
         Section("agreement", "Agreement (Eq. 16)", _agreement(data)),
-        *_figures(data),
+        *(figures or _figures)(data),
         Section("stages", "Stages", _stages(data)),
     ]
     facts = [
@@ -395,7 +395,9 @@ def _plain(value: Json) -> str:
 
 def _temperature(flight: UnfoldedFlight) -> str:
     low, mean, high = flight["temperature_min_degc"], flight["temperature_mean_degc"], flight["temperature_max_degc"]
-    return "not logged" if mean is None else f"{low:.1f} … {high:.1f} °C, mean {mean:.1f}"
+    if mean is None:
+        return "not logged"
+    return f"mean {mean:.1f} °C" if low is None or high is None else f"{low:.1f} … {high:.1f} °C, mean {mean:.1f}"
 
 
 def _or_dash(value: float | None, form: str) -> str:

@@ -73,15 +73,21 @@ class FlightData:
         return {sensor: str(unit) for sensor, unit in units.items()} if isinstance(units, Mapping) else {}
 
 
-def read_flight(root: Path, flight_id: str) -> FlightData:
-    """A flight from the warehouse.
+def read_flight(
+    root: Path,
+    flight_id: str,
+    warehouse: Warehouse | None = None,
+    wanted: Sequence[str] = STAGE_TABLES,
+    signals: Sequence[str] = SIGNAL_TABLES,
+) -> FlightData:
+    """A flight from the warehouse at `root`, or what of it is at hand; of the stages' tables those `wanted`.
 
     Raises
     ------
     FieldcalError
         `no_warehouse`; `not_found`: no flight, or more than one, has this id, this start of an id, or this `log_uri`.
     """
-    warehouse = existing(root)
+    warehouse = warehouse or existing(root)
     flight = typed(map(unfolded, rows_of(_one_flight(warehouse, flight_id))), UnfoldedFlight)[0]
     ids = {"vehicle_id": flight["vehicle_id"], "flight_id": flight["flight_id"]}
     every = {name: warehouse.scan(name, **ids).collect() for name in ("calibration", "fit", "sync", "run")}
@@ -90,11 +96,11 @@ def read_flight(root: Path, flight_id: str) -> FlightData:
     run = typed(map(unfolded, rows_of(history["run"])), UnfoldedRun)
     run.sort(key=lambda row: order.get(row["stage"], len(order)))
     tables: dict[str, pl.DataFrame] = {}
-    for name in SIGNAL_TABLES:
+    for name in signals:
         signal = _signal(warehouse, name, ids)
         if not signal.is_empty():
             tables[f"ingest.{name}"] = signal.drop("vehicle_id", "flight_id")
-    stages, parameters, gone = _stages(root, flight, run)
+    stages, parameters, gone = _stages(root, flight, run, wanted)
     sync = typed(rows_of(history["sync"]), SyncRow)
     return FlightData(
         flight,
@@ -154,12 +160,12 @@ def _signal(warehouse: Warehouse, name: str, ids: Mapping[str, str]) -> pl.DataF
     """Readings of the flight; none where they were removed or are damaged (`fieldcal verify` tells which)."""
     try:
         return warehouse.scan(name, **ids).collect()
-    except (OSError, pl.exceptions.PolarsError):
+    except (OSError, FieldcalError, pl.exceptions.PolarsError):
         return pl.DataFrame()
 
 
 def _stages(
-    root: Path, flight: UnfoldedFlight, run: Sequence[UnfoldedRun]
+    root: Path, flight: UnfoldedFlight, run: Sequence[UnfoldedRun], wanted: Sequence[str]
 ) -> tuple[dict[str, pl.DataFrame], dict[str, Json], tuple[str, ...]]:
     """Tables that are there or can be made again, the parameters of their stages, and the stages that should be there
     and are not."""
@@ -179,7 +185,7 @@ def _stages(
             gone.append(stage)
     written = StageTables(root, flight["vehicle_id"], flight["flight_id"], records)
     tables: dict[str, pl.DataFrame] = {}
-    for name in STAGE_TABLES:
+    for name in wanted:
         stage, table = name.split(".")
         if stage not in records or table not in records[stage]["outputs"]:
             continue

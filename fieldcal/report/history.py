@@ -14,6 +14,11 @@ from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
 from fieldcal.warehouse import Warehouse
 
+REFUSALS_OF_VEHICLE = (
+    "SELECT * FROM refusals WHERE vehicle_id = ? AND level <> 'parameter'"
+    " ORDER BY started_at DESC NULLS LAST, flight_id, level, unit_id, what"
+)
+
 
 class LatestCalibration(TypedDict):
     """What the reports read of a row of the view `latest_calibration`."""
@@ -76,6 +81,11 @@ def as_of_sentence(as_of: datetime | None, given: bool) -> str:
         return "No log's clock has a known epoch: ages are unknown."
     what = "the moment asked for" if given else "the start of the newest flight in the warehouse"
     return f"Ages count to {day(as_of)} UTC, {what}."
+
+
+def refusals_of(warehouse: Warehouse, vehicle_id: str) -> pl.DataFrame:
+    """Flights and stages of a vehicle that were refused, the latest first."""
+    return warehouse.sql(REFUSALS_OF_VEHICLE, [vehicle_id])
 
 
 def reason_of(row: RefusedRow) -> str:

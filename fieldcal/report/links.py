@@ -26,10 +26,11 @@ def flight_name(flight_id: str) -> str:
 
 @dataclass(frozen=True)
 class Links:
-    """Links from a report in `folder`; `expected` names files that will be written there too."""
+    """Links from a report in `folder`; `expected` names files that will be written there too, `fleet` the fleet's."""
 
     folder: Path
     expected: frozenset[str] = frozenset()
+    fleet: str = FLEET
 
     def to(self, name: str, text: str) -> str | Markup:
         """`text` as a link to the report `name`, or the plain text where there is none."""
@@ -37,7 +38,7 @@ class Links:
 
     def up(self) -> tuple[str, str] | None:
         """The fleet page, as a page's `up`."""
-        return (quote(FLEET), "Fleet") if self._there(FLEET) else None
+        return (quote(self.fleet), "Fleet") if self._there(self.fleet) else None
 
     def _there(self, name: str) -> bool:
         return name in self.expected or (self.folder / name).is_file()

@@ -11,16 +11,19 @@ from functools import cache
 from importlib import resources
 from typing import ClassVar
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import fieldcal
-from fieldcal.names import DriftStatus, Status, Verdict
+from fieldcal.names import DriftStatus, Standing, Status, Verdict
 from fieldcal.words.printable import printable
 
-GOOD: tuple[str, ...] = (Status.OK, DriftStatus.STABLE)
-LOOK: tuple[str, ...] = (Verdict.PARTIAL, DriftStatus.DRIFTING, Status.REFUSED, DriftStatus.OUTLIER, "expired")
-BAD: tuple[str, ...] = (Verdict.QUARANTINED, Verdict.REJECTED, Status.FAILED, DriftStatus.STEP)
+GOOD: tuple[str, ...] = (Status.OK, DriftStatus.STABLE, Standing.FINE)
+LOOK: tuple[str, ...] = (
+    *(Verdict.PARTIAL, DriftStatus.DRIFTING, Status.REFUSED, DriftStatus.OUTLIER, "expired"),
+    Standing.LOOK,
+)
+BAD: tuple[str, ...] = (Verdict.QUARANTINED, Verdict.REJECTED, Status.FAILED, DriftStatus.STEP, Standing.NOTHING)
 STATUS_KIND: dict[str, str] = {
     **dict.fromkeys(GOOD, "ok"),
     **dict.fromkeys(LOOK, "look"),
@@ -121,7 +124,7 @@ def html(page: Page) -> str:
     """The page as one file that needs nothing else."""
     up = None if page.up is None else {"href": page.up[0], "text": page.up[1]}
     return (
-        _environment()
+        environment()
         .get_template("report.html")
         .render(
             title=page.title,
@@ -139,18 +142,19 @@ def html(page: Page) -> str:
 def badge(status: str | None) -> Markup:
     """A status as a coloured word."""
     word = status or "unknown"
-    return Markup('<span class="badge {}">{}</span>').format(STATUS_KIND.get(word, "none"), word)
+    return Markup('<span class="badge {}">{}</span>').format(STATUS_KIND.get(word, "none"), printable(word))
 
 
 def link(href: str, text: str) -> Markup:
     """A link; `href` is a relative address made of encoded ids."""
-    return Markup('<a href="{}">{}</a>').format(href, text)
+    return Markup('<a href="{}">{}</a>').format(href, printable(text))
 
 
 @cache
-def _environment() -> Environment:
+def environment(*beside: str) -> Environment:
+    """Templates of the reports, and of packages `beside`, whose own come first."""
     return Environment(
-        loader=PackageLoader("fieldcal.report"),
+        loader=ChoiceLoader([PackageLoader(name) for name in (*beside, "fieldcal.report")]),
         autoescape=True,
         finalize=_shown,
         undefined=StrictUndefined,

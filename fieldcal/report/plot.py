@@ -18,6 +18,7 @@ import numpy.typing as npt
 from markupsafe import Markup, escape
 
 from fieldcal.geometry.rotation import Array
+from fieldcal.words.printable import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -275,6 +276,6 @@ def sparkline(values: Sequence[float], marked: int | None, label: str) -> Markup
     step = "" if marked is None else f'<line class="step" x1="{x[marked]:.1f}" x2="{x[marked]:.1f}" y1="0" y2="28"/>'
     return Markup(
         f'<svg class="spark" viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" height="{height:.0f}"'
-        f' role="img" aria-label="{escape(label)}">{step}<polyline points="{points}"/>'
+        f' role="img" aria-label="{escape(printable(label))}">{step}<polyline points="{points}"/>'
         f'<circle cx="{x[-1]:.1f}" cy="{y[-1]:.1f}" r="2.5"/></svg>'
     )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
@@ -13,9 +14,17 @@ from fieldcal.exports.autopilots.comparison import COLUMNS, compared, lines
 from fieldcal.exports.calibration_at import what_flies
 from fieldcal.exports.handed_out import handed_out
 from fieldcal.names import GRAVEST_FIRST, SENSORS, DriftStatus, Status
-from fieldcal.report.history import LatestCalibration, RefusedRow, as_of_sentence, newest, reason_of, usable_flights
+from fieldcal.report.history import (
+    LatestCalibration,
+    RefusedRow,
+    as_of_sentence,
+    newest,
+    reason_of,
+    refusals_of,
+    usable_flights,
+)
 from fieldcal.report.links import Links, flight_name
-from fieldcal.report.page import Column, Folded, Heading, Notice, Page, Part, Section, Simple, Table, Text, badge
+from fieldcal.report.page import Column, Folded, Heading, Notice, Page, Part, Plot, Section, Simple, Table, Text, badge
 from fieldcal.report.trend import change_sentence, fly_with_sentence, worst_status
 from fieldcal.report.vehicle_figures import MOST_POINTS, agreement_plot, lag_plot, parameter_plot
 from fieldcal.report.words import PARAMETERS, age, count, day, plain_name, preferred, scientific, unit
@@ -36,9 +45,29 @@ OPEN = ("scale", "zero_bias", WARM_UP_SLOPE)
 """Parameters whose plots are open; the others say the same in other words."""
 
 
-def vehicle_page(root: Path, vehicle_id: str, links: Links, as_of: datetime | None) -> Page:
-    """The page, from the history below `root`."""
-    warehouse = existing(root)
+@dataclass(frozen=True)
+class Drawing:
+    """How a vehicle's figures are drawn; `most`: flights in a table of them."""
+
+    parameter: Callable[[pl.DataFrame, Mapping[str, DriftRow], str, str, str, int], Plot] = parameter_plot
+    agreement: Callable[[pl.DataFrame, str], Plot | None] = agreement_plot
+    lag: Callable[[pl.DataFrame, str], Plot | None] = lag_plot
+    most: int = FLIGHTS
+
+
+ON_PAPER = Drawing()
+
+
+def vehicle_page(
+    root: Path,
+    vehicle_id: str,
+    links: Links,
+    as_of: datetime | None,
+    warehouse: Warehouse | None = None,
+    drawing: Drawing = ON_PAPER,
+) -> Page:
+    """The page, from the history below `root`, or from what of it is at hand."""
+    warehouse = warehouse or existing(root)
     flights = warehouse.scan("flight", vehicle_id=vehicle_id).sort(FLOWN_ORDER, nulls_last=False).collect()
     if flights.is_empty():
         known_vehicle(warehouse, vehicle_id)
@@ -60,12 +89,12 @@ def vehicle_page(root: Path, vehicle_id: str, links: Links, as_of: datetime | No
         ("IMU", imus[0] if len(imus) == 1 else f"{imus[0]}; before: {', '.join(imus[1:])}"),
     ]
     sections = [
-        Section("fly", "What to fly with", [*_fly_with(warehouse, flown), *_before_and_after(root, vehicle_id)]),
+        Section("fly", "What to fly with", [*_fly_with(warehouse, flown), *_before_and_after(warehouse, vehicle_id)]),
         Section("trend", "Trends", _trends(current, usable.height)),
-        *_parameters(warehouse, vehicle_id, units, drift),
-        Section("agreement", "Agreement", _agreement(warehouse, vehicle_id)),
-        Section("clock", "VPS clock", _clock(warehouse, vehicle_id)),
-        Section("flights", "Flights", [_flights(flights, usable, links)]),
+        *_parameters(warehouse, vehicle_id, units, drift, drawing),
+        Section("agreement", "Agreement", _agreement(warehouse, vehicle_id, drawing)),
+        Section("clock", "VPS clock", _clock(warehouse, vehicle_id, drawing)),
+        Section("flights", "Flights", [_flights(flights, usable, links, drawing.most)]),
         *_decisions(flights, root, links),
         Section("refusals", "Refusals", _refusals(warehouse, vehicle_id, flown, links)),
     ]
@@ -129,15 +158,15 @@ def _sources(by_axis: Mapping[str, LatestCalibration]) -> str:
     return " ".join(f"{', '.join(names)}: {source}" for source, names in axes.items())
 
 
-def _before_and_after(root: Path, vehicle_id: str) -> list[Part]:
+def _before_and_after(warehouse: Warehouse, vehicle_id: str) -> list[Part]:
     """What its autopilot flies with, where the logs tell."""
     try:
-        rows, _ = compared(what_flies(root, vehicle_id))
+        rows, _ = compared(what_flies(warehouse.root, vehicle_id, warehouse=warehouse))
     except FieldcalError:
         return []
     numeric = ("flies with", "estimate", "difference", "which is")
     return [
-        *(Text(one.sentence) for one in handed_out(root, vehicle_id)),
+        *(Text(one.sentence) for one in handed_out(warehouse.root, vehicle_id)),
         Table(
             "What the autopilot flew with beside what is estimated (fieldcal compare)",
             tuple(Column(name, "n") if name in numeric else Column(name) for name in COLUMNS),
@@ -225,7 +254,9 @@ def _trend_table(caption: str, rows: Sequence[DriftRow]) -> Table:
     return Table(caption, columns, lines)
 
 
-def _parameters(warehouse: Warehouse, vehicle_id: str, units: list[str], drift: pl.DataFrame) -> list[Section]:
+def _parameters(
+    warehouse: Warehouse, vehicle_id: str, units: list[str], drift: pl.DataFrame, drawing: Drawing
+) -> list[Section]:
     """A section per sensor: the plots of its most exact method, the unit that it flew with last first."""
     rows = (
         warehouse.scan("calibration")
@@ -233,7 +264,7 @@ def _parameters(warehouse: Warehouse, vehicle_id: str, units: list[str], drift: 
         .sort(FLOWN_ORDER, nulls_last=False)
         .collect()
     )
-    panels = max(3 * len(units), rows.select("unit_id", "axis").unique().height)
+    panels = max(3 * len(units), 1, rows.select("unit_id", "axis").unique().height)
     most = max(FEWEST_POINTS, 3 * MOST_POINTS // panels)
     sections: list[Section] = []
     for sensor in sorted(rows["sensor"].unique().to_list(), key=lambda name: _place(SENSORS, name)):
@@ -243,18 +274,20 @@ def _parameters(warehouse: Warehouse, vehicle_id: str, units: list[str], drift: 
             here = pl.col("sensor") == sensor, pl.col("unit_id") == unit_id
             if len(own_units) > 1:
                 parts.append(Heading(f"Unit {unit_id}"))
-            parts += _sensor(rows.filter(*here), drift.filter(*here), vehicle_id, most)
+            parts += _sensor(rows.filter(*here), drift.filter(*here), vehicle_id, most, drawing)
         sections.append(Section(f"sensor-{len(sections) + 1}", sensor.capitalize(), parts))
     return sections
 
 
-def _sensor(rows: pl.DataFrame, drift: pl.DataFrame, vehicle_id: str, most: int) -> list[Part]:
+def _sensor(rows: pl.DataFrame, drift: pl.DataFrame, vehicle_id: str, most: int, drawing: Drawing) -> list[Part]:
     methods = set(rows["method"].to_list())
     shown = dict.fromkeys((preferred(methods), *(methods & {WARM_UP})))
-    return [part for method in shown for part in _method(rows, drift, method, vehicle_id, most)]
+    return [part for method in shown for part in _method(rows, drift, method, vehicle_id, most, drawing)]
 
 
-def _method(rows: pl.DataFrame, drift: pl.DataFrame, method: str, vehicle_id: str, most: int) -> list[Part]:
+def _method(
+    rows: pl.DataFrame, drift: pl.DataFrame, method: str, vehicle_id: str, most: int, drawing: Drawing
+) -> list[Part]:
     rows = rows.filter(pl.col("method") == method)
     sensor, unit_id = rows["sensor"][0], rows["unit_id"][0]
     there = sorted(rows["parameter"].unique().to_list(), key=lambda name: (_place(PARAMETERS, name), name))
@@ -266,7 +299,7 @@ def _method(rows: pl.DataFrame, drift: pl.DataFrame, method: str, vehicle_id: st
         of_axes = typed(trend.iter_rows(named=True), DriftRow)
         by_axis = {r["axis"]: r for r in of_axes if r["status"] != DriftStatus.INSUFFICIENT}
         anchor = f"plot-{_slug(sensor, parameter, unit_id)}"
-        plot = parameter_plot(own, by_axis, vehicle_id, f"{sensor} {parameter}", anchor, most)
+        plot = drawing.parameter(own, by_axis, vehicle_id, f"{sensor} {parameter}", anchor, most)
         (parts if parameter in OPEN else folded).append(plot)
     if folded:
         parts.append(Folded(f"The same as {' and '.join(p for p in there if p not in OPEN)}", folded))
@@ -280,20 +313,22 @@ def _slug(*names: str) -> str:
     return hashlib.sha256("\0".join(names).encode("utf-8", "surrogatepass")).hexdigest()[:10]
 
 
-def _agreement(warehouse: Warehouse, vehicle_id: str) -> list[Part]:
-    plot = agreement_plot(warehouse.scan("fit", vehicle_id=vehicle_id).filter("is_primary").collect(), "plot-agreement")
+def _agreement(warehouse: Warehouse, vehicle_id: str, drawing: Drawing) -> list[Part]:
+    plot = drawing.agreement(
+        warehouse.scan("fit", vehicle_id=vehicle_id).filter("is_primary").collect(), "plot-agreement"
+    )
     return [Text("No flight has anything to compare with.")] if plot is None else [plot]
 
 
-def _clock(warehouse: Warehouse, vehicle_id: str) -> list[Part]:
+def _clock(warehouse: Warehouse, vehicle_id: str, drawing: Drawing) -> list[Part]:
     sync = warehouse.scan("sync", vehicle_id=vehicle_id).filter("is_primary").collect()
-    plot = lag_plot(sync, "plot-clock")
+    plot = drawing.lag(sync, "plot-clock")
     refused = sync.filter(pl.col("status") != Status.OK).height
     parts: list[Part] = [Text("No flight was synchronised with a VPS.")] if plot is None else [plot]
     return [*parts, Text(f"Synchronisation was refused in {count(refused, 'flight')}.")] if refused else parts
 
 
-def _flights(flights: pl.DataFrame, usable: pl.DataFrame, links: Links) -> Table:
+def _flights(flights: pl.DataFrame, usable: pl.DataFrame, links: Links, most: int) -> Table:
     columns = (
         Column("flight"),
         Column("started (UTC)", "nowrap"),
@@ -318,13 +353,9 @@ def _flights(flights: pl.DataFrame, usable: pl.DataFrame, links: Links) -> Table
             str(r["log_uri"]),
             r["reason"] or "; ".join(str(f["sentence"]) for f in r["findings"] or [])[:300],
         ]
-        for r in typed(map(unfolded, flights.reverse().head(FLIGHTS).iter_rows(named=True)), UnfoldedFlight)
+        for r in typed(map(unfolded, flights.reverse().head(most).iter_rows(named=True)), UnfoldedFlight)
     ]
-    more = (
-        f"{flights.height - FLIGHTS} earlier flights are not shown: fieldcal history."
-        if flights.height > FLIGHTS
-        else ""
-    )
+    more = f"{flights.height - most} earlier flights are not shown: fieldcal history." if flights.height > most else ""
     return Table("Flights, the latest first (fieldcal report --flight ID writes a flight's page)", columns, lines, more)
 
 
@@ -344,11 +375,7 @@ def _decisions(flights: pl.DataFrame, root: Path, links: Links) -> list[Section]
 
 
 def _refusals(warehouse: Warehouse, vehicle_id: str, flown: pl.DataFrame, links: Links) -> list[Part]:
-    rows = warehouse.sql(
-        "SELECT * FROM refusals WHERE vehicle_id = ? AND level <> 'parameter'"
-        " ORDER BY started_at DESC NULLS LAST, flight_id, level, unit_id, what",
-        [vehicle_id],
-    )
+    rows = refusals_of(warehouse, vehicle_id)
     if rows.is_empty():
         return [Text("Nothing was refused.")]
     primary = {None, *flown["unit_id"]}

@@ -94,10 +94,10 @@ def changes(
     return sorted(found, key=lambda c: (KINDS.index(c.kind), c.vehicle_id, c.sensor or "", c.axis or ""))
 
 
-def last_usable(root: Path) -> pl.DataFrame:
+def last_usable(root: Path, warehouse: Warehouse | None = None) -> pl.DataFrame:
     """vehicle_id, imu_id, unit_id, sensor, last_at: latest flight with a time that calibrated each sensor."""
     return (
-        Warehouse(root)
+        (warehouse or Warehouse(root))
         .scan("calibration")
         .filter((pl.col("status") == Status.OK) & pl.col("started_at").is_not_null())
         .group_by("vehicle_id", "imu_id", "unit_id", "sensor")

@@ -152,6 +152,7 @@ def test_the_night_as_json(capsys: pytest.CaptureFixture[str], archive: Path, wa
         "server_seconds",
         "changes",
         "report",
+        "site",
     }
     assert (found["ok"], found["no_result"], found["rejected"], found["stages_run"]) == (1, 1, 1, 0)
     assert {"log_uri", "flight_id", "verdict", "reason_code", "reason"} <= set(found["logs"][0])

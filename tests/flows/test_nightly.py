@@ -182,6 +182,7 @@ def test_a_history_of_an_older_release_is_shown_and_brought_up_to_date(simulated
         "history",
         "drift",
         "report",
+        "site",
         "report --vehicle sim-1",
         f"report --flight {flight_id}",
         "export sim-1",

@@ -22,6 +22,7 @@ REPOSITORY = Path(__file__).parents[2]
 LEFT_BEHIND = shutil.ignore_patterns(
     ".*", "*.egg-info", "build", "dist", "__pycache__", "tests", "benchmarks", "docs", "*.so"
 )
+SITE = ("site/templates/site.html", "site/assets/charts.js", "site/assets/uplot/LICENSE")
 HOSTILE = ("flows", "schemas", "warehouse", "fieldcal", "polars")
 
 
@@ -63,7 +64,7 @@ def test_the_wheel_holds_one_package_and_its_data(wheel: Path) -> None:
     assert "fieldcal" in tops
     assert {top for top in tops if top != "fieldcal"} == {f"{'-'.join(wheel.name.split('-')[:2])}.dist-info"}
     files = ("py.typed", "warehouse/views/history.sql", "report/templates/style.css", "onboard/c/fieldcal_onboard.h")
-    for needed in (*files, "flows/nightly.py"):
+    for needed in (*files, *SITE, "flows/nightly.py"):
         assert f"fieldcal/{needed}" in names
     modules = {str(path.relative_to(REPOSITORY)) for path in (REPOSITORY / "fieldcal").rglob("*.py")}
     assert modules <= set(names)

@@ -1,23 +1,19 @@
 """The three reports in a real headless Chromium: no console errors, no request, plots that are there, light and dark,
 keyboard and print.
 
-Chromium and its driver are Debian's (`apt-get install chromium chromium-driver`); without them these tests fail where
-CI is set and are skipped elsewhere. FIELDCAL_SCREENSHOTS names a folder that keeps the screenshots.
+FIELDCAL_SCREENSHOTS names a folder that keeps the screenshots.
 """
 
 from __future__ import annotations
 
 import base64
-import io
-import os
 import re
-import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from browser_support import WIDER_THAN_THE_WINDOW, browser, picture, show
 from report_rows import publish_fleet
 
 from fieldcal.flight.calibrate import identify, read, run_stages
@@ -25,20 +21,8 @@ from fieldcal.report import log_report, write_night_reports
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 
-webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is part of the extra `test`")
+__all__ = ["browser"]  # a fixture
 
-SWITCHES = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--hide-scrollbars",
-    "--window-size=1280,900",
-)
 PLOTS = {"fleet": 5, "vehicle": 6, "flight": 9}
 """Drawings open on each page: sparklines; scale and zero_bias of three sensors; Figures 5–10 and three more."""
 
@@ -56,29 +40,7 @@ return [...document.querySelectorAll('svg')].filter(svg => svg.checkVisibility()
           named: !!(svg.getAttribute('aria-label') || svg.querySelector('title')?.textContent)};
 });
 """
-WIDER_THAN_THE_WINDOW = "return document.documentElement.scrollWidth - window.innerWidth;"
 FOCUS = "const e = document.activeElement; return [e.tagName, e.textContent.trim(), getComputedStyle(e).outlineStyle];"
-
-
-def found(name: str) -> str:
-    """Path of a program; without it the test fails under CI and is skipped elsewhere."""
-    path = shutil.which(name)
-    if path is None:
-        why = f"{name} is not installed: apt-get install chromium chromium-driver"
-        pytest.fail(why) if os.environ.get("CI") else pytest.skip(why)
-    return path
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    options = webdriver.ChromeOptions()
-    options.binary_location = found("chromium")
-    for switch in (*SWITCHES, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(switch)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options, webdriver.ChromeService(found("chromedriver")))
-    yield driver
-    driver.quit()
 
 
 @pytest.fixture(scope="module")
@@ -94,27 +56,6 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "vehicle": vehicle,
         "flight": log_report(run_stages(read(*identify(log))), root / "flight.html"),
     }
-
-
-def show(browser: Any, path: Path, scheme: str = "light") -> None:
-    """Open a page in a colour scheme."""
-    features = [{"name": "prefers-color-scheme", "value": scheme}]
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "screen", "features": features})
-    browser.get(path.as_uri())
-
-
-def picture(browser: Any, name: str) -> np.ndarray:
-    """The whole page as (height, width, 3) levels 0–255."""
-    from PIL import Image
-
-    size = browser.execute_cdp_cmd("Page.getLayoutMetrics", {})["cssContentSize"]
-    clip = {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
-    shot = browser.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True, "clip": clip})
-    png = base64.b64decode(shot["data"])
-    if folder := os.environ.get("FIELDCAL_SCREENSHOTS"):
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        (Path(folder) / f"{name}.png").write_bytes(png)
-    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(float)
 
 
 @pytest.mark.parametrize("page", PLOTS)

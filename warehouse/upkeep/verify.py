@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, TypedDict, cast
 
 from fieldcal.errors import FieldcalError
 from fieldcal.reason_codes import ReasonCode
@@ -13,7 +13,7 @@ from fieldcal.warehouse import checksums
 from fieldcal.warehouse.content import content_sha256
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import TEMPORARY, file_sha256
-from fieldcal.warehouse.layout import history_files, twin
+from fieldcal.warehouse.layout import SITE, history_files, twin
 from fieldcal.warehouse.sealed import BrokenSeal, unseal
 from fieldcal.warehouse.stage_store import RECORD, broken_outputs, outputs_of
 from fieldcal.warehouse.store import read_table
@@ -41,8 +41,8 @@ class Verification(TypedDict):
 
 
 def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path], str] | None = None) -> Verification:
-    """Check `tables/`, `signals/`, `reports/`, complete stage outputs, what nights remember and, with `archive`, the
-    logs. Reports that an older release wrote have no recorded sha256 and are passed over.
+    """Check `tables/`, `signals/`, `reports/`, complete stage outputs, what nights remember, the site and, with
+    `archive`, the logs. Reports that an older release wrote have no recorded sha256 and are passed over.
 
     Nothing is changed.
 
@@ -68,7 +68,7 @@ def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path],
         raise WarehouseError(
             ReasonCode.NO_WAREHOUSE, f"There is no warehouse at {root}; run `fieldcal nightly` or give --warehouse."
         )
-    found = [*_recorded_files(root), *_stage_files(root), *night_files(root)]
+    found = [*_recorded_files(root), *_stage_files(root), *night_files(root), *_site_files(root)]
     if archive is not None:
         if log_sha256 is None:
             raise ValueError("log_sha256 is needed to check an archive")
@@ -132,6 +132,25 @@ def night_files(root: Path) -> Iterator[Problem]:
             data = path.read_bytes()
         whole = hashlib.sha256(data[SHA256_BYTES:]).digest() == data[:SHA256_BYTES]
         yield str(path.relative_to(root)), None if whole else "what the night remembers is damaged; it may be deleted"
+
+
+def _site_files(root: Path) -> Iterator[Problem]:
+    """Pages of vehicles and flights, by what the night remembers of them. One that is not there is made anew."""
+    for path in sorted((root / "night" / SITE).glob("*.json")):
+        try:
+            ledger = unseal(path.read_bytes())
+        except (OSError, BrokenSeal):
+            continue  # told by `night_files`
+        parts = [ledger["files"], *(files for _, files in cast(Mapping[str, list[Any]], ledger["flights"]).values())]
+        for name, (sha256, _) in sorted(
+            pair for files in cast(list[Mapping[str, list[Any]]], parts) for pair in files.items()
+        ):
+            page = root / SITE / name
+            whole = not page.exists() or file_sha256(page) == sha256
+            wrong = (
+                "its content is not what was written: the sha256 differs; it may be deleted, `fieldcal site` follows"
+            )
+            yield str(page.relative_to(root)), None if whole else wrong
 
 
 def _logs(root: Path, archive: Path, log_sha256: Callable[[Path], str]) -> Iterator[Problem]:

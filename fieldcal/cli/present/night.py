@@ -47,6 +47,9 @@ def print_night(console: Console, result: NightDocument, root: Path) -> None:
             console.print(f"  … and {len(lines) - CHANGES} more: fieldcal drift", markup=False)
     console.print(f"History: {root}/tables (fieldcal history, drift, sql)", markup=False)
     console.print(f"Report:  {result['report']} (fieldcal report --vehicle V, --flight ID)", markup=False)
+    console.print(
+        f"Site:    {result['site']} (every vehicle and flight; any web server serves its folder)", markup=False
+    )
 
 
 def _refusals(log: LogEntry) -> list[list[str]]:

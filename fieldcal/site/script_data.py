@@ -1,0 +1,24 @@
+"""Data as scripts: pages opened from a disk may load nothing else. Nothing in them ends the script or the line."""
+
+from __future__ import annotations
+
+import json
+
+from fieldcal.names import Json
+from fieldcal.words.printable import printable
+
+_ESCAPES = str.maketrans({"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "'": "\\u0027"})
+
+
+def script(name: str, value: Json) -> bytes:
+    """A script that hands `value` over as the data `name`: ASCII, and no character that HTML knows."""
+    return f"fieldcalData({_literal(name)},{_literal(value)});\n".encode("ascii")
+
+
+def shown(text: str | None) -> str:
+    """A name from a log as a page may show it."""
+    return printable(text or "")
+
+
+def _literal(value: Json) -> str:
+    return json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":")).translate(_ESCAPES)
