@@ -1,4 +1,4 @@
-"""Pages: `fieldcal report`, of fleet, vehicle or flight, in one offline HTML file; `fieldcal site`, all of them linked."""
+"""Pages: `fieldcal report`, of fleet, vehicle or flight, one offline HTML file; `fieldcal site`, all of them linked."""
 
 from __future__ import annotations
 
