@@ -120,6 +120,19 @@ def _fly_with(warehouse: Warehouse, flown: pl.DataFrame) -> list[Part]:
     rows = warehouse.sql("SELECT * FROM latest_calibration").join(flown, on=["unit_id", "sensor"], how="semi")
     if rows.is_empty():
         return [Notice("No flight gave a constant: there is nothing to fly with.")]
+    caption = f"Latest constants at {REFERENCE_DEGC:g} °C, ± one standard deviation (view latest_calibration)"
+    alone = pl.col("axis").str.len_chars() <= 1
+    own, terms = rows.filter(alone), rows.filter(~alone)
+    parts: list[Part] = [
+        Text("z = scale · logged + bias, sensor axes. A constant of one flight holds at its temperature."),
+        _constants_table(caption, own),
+    ]
+    if terms.height:
+        parts.append(Folded("Scales as whole matrices", [_constants_table(f"{caption}, by row and column", terms)]))
+    return parts
+
+
+def _constants_table(caption: str, rows: pl.DataFrame) -> Table:
     axes = sorted(rows["axis"].unique().to_list())
     by_place: dict[tuple[str, str], dict[str, LatestCalibration]] = {}
     for r in typed(rows.iter_rows(named=True), LatestCalibration):
@@ -138,14 +151,7 @@ def _fly_with(warehouse: Warehouse, flown: pl.DataFrame) -> list[Part]:
         Column("method"),
         Column("from", "wide"),
     ]
-    return [
-        Text("z = scale · logged + bias, sensor axes. A constant of one flight holds at its temperature."),
-        Table(
-            f"Latest constants at {REFERENCE_DEGC:g} °C, ± one standard deviation (view latest_calibration)",
-            columns,
-            lines,
-        ),
-    ]
+    return Table(caption, columns, lines)
 
 
 def _sources(by_axis: Mapping[str, LatestCalibration]) -> str:
