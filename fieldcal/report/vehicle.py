@@ -121,14 +121,16 @@ def _fly_with(warehouse: Warehouse, flown: pl.DataFrame) -> list[Part]:
     if rows.is_empty():
         return [Notice("No flight gave a constant: there is nothing to fly with.")]
     caption = f"Latest constants at {REFERENCE_DEGC:g} °C, ± one standard deviation (view latest_calibration)"
-    alone = pl.col("axis").str.len_chars() <= 1
+    alone = pl.col("axis").str.len_chars() == 1
     own, terms = rows.filter(alone), rows.filter(~alone)
     parts: list[Part] = [
         Text("z = scale · logged + bias, sensor axes. A constant of one flight holds at its temperature."),
         _constants_table(caption, own),
     ]
     if terms.height:
-        parts.append(Folded("Scales as whole matrices", [_constants_table(f"{caption}, by row and column", terms)]))
+        parts.append(
+            Folded("Whole matrices, and what has no axis", [_constants_table(f"{caption}, by row and column", terms)])
+        )
     return parts
 
 
@@ -146,7 +148,7 @@ def _constants_table(caption: str, rows: pl.DataFrame) -> Table:
         lines.append([f"{sensor} {parameter}", *values, unit(any_axis["unit"]), ", ".join(methods), _sources(own)])
     columns = [
         Column("parameter"),
-        *(Column(axis, "n") for axis in axes),
+        *(Column(axis or "–", "n") for axis in axes),
         Column("unit"),
         Column("method"),
         Column("from", "wide"),
