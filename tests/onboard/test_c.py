@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,11 @@ def folder(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def flight(seed: int = 1, **changes: object) -> np.ndarray:
     """A whole simulated flight at 400 Hz."""
+    return simulated(seed, **changes).copy()
+
+
+@cache
+def simulated(seed: int, **changes: object) -> np.ndarray:
     flown = fieldcal.simulate(seed=seed, rate_hz=RATE_HZ, **changes)
     out = np.zeros(len(flown.t), dtype=SAMPLE)
     out["t_us"], out["has_field"] = np.rint(flown.t * 1e6), 1
