@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 
 from rich.console import Console
@@ -11,7 +12,8 @@ from fieldcal.batch.documents import LogEntry, NightDocument, PlanDocument, Plan
 from fieldcal.batch.outcome import cause, verdict_counts
 from fieldcal.cli.show import table
 from fieldcal.logs.unread import Unread, told
-from fieldcal.names import Verdict
+from fieldcal.names import Standing, Verdict
+from fieldcal.report.fitness import fleet_fitness, remembered_alerts
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.flights import is_consequence
 from fieldcal.words.numbers import number
@@ -19,6 +21,7 @@ from fieldcal.words.numbers import number
 WORST = 5
 REFUSALS = 12
 CHANGES = 20
+VEHICLES = 15
 
 
 def print_night(console: Console, result: NightDocument, root: Path) -> None:
@@ -27,6 +30,7 @@ def print_night(console: Console, result: NightDocument, root: Path) -> None:
     work = f"{result['stages_run']} stages run, {result['stages_cached']} from the cache, {result['seconds']:.1f} s"
     console.print(f"{len(result['logs'])} logs: {counts}; {work}", markup=False)
     print_unread(console, result["unread"])
+    print_fleet(console, root)
     troubled = [log for log in result["logs"] if log["verdict"] != Verdict.OK or log["reason_code"]]
     if troubled:
         lines = [[log["log_uri"], log["verdict"], log["reason"] or ""] for log in troubled]
@@ -50,6 +54,31 @@ def print_night(console: Console, result: NightDocument, root: Path) -> None:
     console.print(
         f"Site:    {result['site']} (every vehicle and flight; any web server serves its folder)", markup=False
     )
+
+
+def print_fleet(console: Console, root: Path) -> None:
+    """Which vehicles are fine to fly, and of the others why not, the gravest first: as the site says it."""
+    fleet = fleet_fitness(Warehouse(root), remembered_alerts(root), datetime.now(UTC))
+    if not fleet:
+        return
+    fine = sum(one.standing == Standing.FINE for one in fleet.values())
+    console.print(f"Fleet: {fine} of {len(fleet)} vehicles fine to fly", markup=False)
+    order = list(Standing)
+    others = sorted(
+        (one for one in fleet.values() if one.standing != Standing.FINE),
+        key=lambda one: (order.index(one.standing), one.vehicle_id),
+    )
+    if others:
+        lines = [[one.vehicle_id, one.standing, _first(one.reasons)] for one in others[:VEHICLES]]
+        console.print(table(["vehicle", "standing", "why"], lines))
+        if len(others) > VEHICLES:
+            console.print(f"  … and {len(others) - VEHICLES} more: the site's first page", markup=False)
+
+
+def _first(reasons: Sequence[str]) -> str:
+    """The gravest reason, and how many others there are."""
+    more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
+    return f"{reasons[0]}{more}" if reasons else ""
 
 
 def _refusals(log: LogEntry) -> list[list[str]]:

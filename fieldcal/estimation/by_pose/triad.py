@@ -84,7 +84,9 @@ class TriadByPose:
         value = back @ value
         covariance[at], covariance[:, at] = 0.0, 0.0
         matrix = value[:9].reshape(3, 3)
-        matrix[tuple(np.array(elements).T)] = 0.0  # exactly: rounding leaves dust
+        # Exactly, as those that the axes make zero: rounding leaves dust.
+        matrix[tuple(np.array(elements).T)] = 0.0
+        matrix[self.matrix == 0.0] = 0.0
         return replace(self, matrix=matrix, bias=value[9:], covariance=back @ covariance @ back.T)
 
 
@@ -108,7 +110,7 @@ def body_axes(triad: TriadByPose, polarity: ArrayLike) -> tuple[TriadByPose, Arr
         turn, upper = np.linalg.qr(matrix[:, ::-1])  # M J = Q R, so M = (Q J)(J R J)
         q, left = turn[:, ::-1], upper[::-1, ::-1]
         signs = np.where(np.sign(np.diagonal(left)) == sign, 1.0, -1.0)
-        q, left = q * signs, left * signs[:, None]
+        q, left = q * signs, np.tril(left * signs[:, None])  # exactly: rounding leaves dust
         return np.r_[left.ravel(), q.T @ bias], q.T
 
     at = np.r_[triad.matrix.ravel(), triad.bias]

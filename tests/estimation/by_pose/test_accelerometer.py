@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numerics_support import rms
@@ -114,6 +116,7 @@ def test_axes_of_its_own_are_found_whatever_the_trajectory_s(flown: Flown) -> No
 
 def test_square_axes_are_the_estimate_given_zero_elements(flown: Flown) -> None:
     own, _, _ = body_axes(flown.fitted(), np.ones(3))
+    assert np.all(own.matrix[np.triu_indices(3, 1)] == 0.0)
     square = own.square(flown.logged.mean(axis=0), CROSS["accelerometer"])
     assert not square.matrix[np.tril_indices(3, -1)].any()
     assert square.cross_sd is None
@@ -121,6 +124,16 @@ def test_square_axes_are_the_estimate_given_zero_elements(flown: Flown) -> None:
     assert own.cross_test(CROSS["accelerometer"]) > 1e3
     # What the elements may be stays in the sd of the diagonal.
     assert (np.diagonal(square.diagonal_covariance)[:3] >= 0.99 * np.diagonal(own.diagonal_covariance)[:3]).all()
+
+
+def test_square_axes_have_no_dust_of_rounding(flown: Flown) -> None:
+    """Which made a full matrix of it, its elements 1e-19 with standard deviations of 1e-22."""
+    rng, fit = np.random.default_rng(4), flown.fitted()
+    for _ in range(40):
+        root = 1e-4 * rng.normal(size=(12, 12))
+        own, _, _ = body_axes(replace(fit, covariance=root @ root.T), np.ones(3))
+        square = own.square(flown.logged.mean(axis=0), CROSS["accelerometer"])
+        np.testing.assert_array_equal(square.matrix, np.diag(np.diagonal(square.matrix)))
 
 
 def test_outliers_of_the_position_do_not_count(flown: Flown) -> None:
