@@ -351,6 +351,7 @@ def test_serve_registers_its_deployments_anew(place: Path, served: Path, monkeyp
     assert not after.paused
 
 
+@outside_ci
 def test_a_stale_secret_is_one_sentence(place: Path, served: Path) -> None:
     """In the file of our own server; in the environment for the user's own; none there."""
     (own,) = [path for path in (place / "archive").glob("sim-1/*") if not path.is_symlink()]

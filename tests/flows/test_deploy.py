@@ -15,6 +15,7 @@ from typing import Any
 from uuid import uuid4
 
 import pytest
+from outside_ci import outside_ci
 
 from fieldcal.batch.landing import Landing
 from fieldcal.flows.connection import connected, kept_secret
@@ -112,6 +113,7 @@ def test_a_triggered_session_is_in_the_history_and_runs_once(archive: Path, serv
     assert {row["sensor"] for row in json.loads(told.stdout)} == {"magnetometer", "accelerometer", "gyroscope"}
 
 
+@outside_ci
 def test_an_event_does_the_same_once_however_often_it_comes(archive: Path, served: Path) -> None:
     from prefect.client.orchestration import get_client
 
@@ -137,6 +139,7 @@ def test_the_night_is_scheduled(served: Path) -> None:
     assert all(run.auto_scheduled and run.expected_start_time.hour == 3 for run in upcoming)
 
 
+@outside_ci
 def test_without_a_server_it_fails_at_once_and_the_night_takes_the_session(
     archive: Path, tmp_path: Path, prefect_server: str
 ) -> None:
@@ -163,6 +166,7 @@ def test_a_server_without_the_deployment_is_told(
     assert "no deployment session/fieldcal" in capsys.readouterr().err
 
 
+@outside_ci
 def test_a_wrong_schedule_is_a_usage_error(archive: Path, tmp_path: Path) -> None:
     told = command("serve", str(archive), "--warehouse", str(tmp_path / "w"), "--cron", "every night")
     assert (told.returncode, told.stderr.count("\n")) == (2, 1)

@@ -93,6 +93,7 @@ def tasks_of_runs(url: str) -> dict[str, Counter[str]]:
     return found
 
 
+@outside_ci
 def test_a_missing_scheduler_is_told(archive: Path, tmp_path: Path, prefect_server: str) -> None:
     with pytest.raises(FieldcalError, match=r"No Dask scheduler answers at tcp://127\.0\.0\.1:9"):
         run_night(archive, tmp_path, None, None, 2, runner="dask", scheduler="tcp://127.0.0.1:9")
@@ -103,9 +104,10 @@ def test_a_missing_work_pool_is_told(archive: Path, tmp_path: Path, prefect_serv
         run_night(archive, tmp_path, None, None, 2, runner="pool")
 
 
+@outside_ci
 @pytest.mark.parametrize(
     ("workers", "seed", "zone"),
-    [pytest.param("2", "1", "Asia/Tokyo", marks=outside_ci), ("4", "0", "America/New_York")],
+    [("2", "1", "Asia/Tokyo"), ("4", "0", "America/New_York")],
 )
 def test_workers_order_seed_and_time_zone_make_no_difference(
     archive: Path, content: str, tmp_path: Path, workers: str, seed: str, zone: str

@@ -14,6 +14,7 @@ from typing import Any
 from uuid import UUID
 
 import pytest
+from outside_ci import outside_ci
 
 from fieldcal.errors import FieldcalError
 from fieldcal.flows import housekeeping
@@ -74,6 +75,7 @@ def address(process: subprocess.Popen[str]) -> str:
     return process.stdout.readline().strip()
 
 
+@outside_ci
 def test_two_commands_at_once_share_a_server_that_ends_with_the_last(tmp_path: Path) -> None:
     first, second = user(tmp_path), user(tmp_path)
     url = address(first)
@@ -169,6 +171,7 @@ def test_a_killed_run_is_ended_at_the_next_start(archive: Path, tmp_path: Path, 
     assert list((root / FOLDER).iterdir()) == []
 
 
+@outside_ci
 def test_old_runs_and_all_beyond_many_are_removed_with_their_tasks(
     archive: Path, tmp_path: Path, prefect_server: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

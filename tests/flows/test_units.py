@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from outside_ci import outside_ci
 
 import fieldcal
 from fieldcal.flows.run import dry_run, run_night
@@ -281,6 +282,7 @@ def test_every_unit_is_exported_into_the_slot_of_its_device(night: Night) -> Non
     assert all(told.startswith("magnetometer") and "in norm" in told for told in left_out)
 
 
+@outside_ci
 @pytest.mark.parametrize("night", ["bin"], indirect=True)
 def test_reports_tell_the_units_apart(night: Night) -> None:
     flight = night.warehouse.scan("flight").collect()["flight_id"][0]
@@ -306,6 +308,7 @@ def test_nothing_runs_again_and_one_unit_is_calibrated_by_itself(night: Night) -
         fieldcal.calibrate(night.log, config=night.archive / "fieldcal.toml", unit="imu.7")
 
 
+@outside_ci
 def test_the_further_units_are_left_out_where_only_the_primary_ones_are_asked_for(night: Night, tmp_path: Path) -> None:
     config = tmp_path / "fieldcal.toml"
     text = (night.archive / "fieldcal.toml").read_text()

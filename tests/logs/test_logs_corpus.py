@@ -17,6 +17,7 @@ from damaged_mcap import damaged_files, flip
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from logs_support import vehicle
+from outside_ci import outside_ci
 
 from fieldcal.logs.ingest import read_flight
 
@@ -45,6 +46,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
     return Truth(tmp_path_factory.mktemp("truth"))
 
 
+@outside_ci
 def test_mcap_corpus(tmp_path: Path, truth: Truth) -> None:
     found, peak_mb = outcomes("mcap", tmp_path)
     assert [outcome["name"] for outcome in found] == [kind.name for kind in damaged_files(truth.sound)]

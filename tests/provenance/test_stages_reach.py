@@ -274,6 +274,7 @@ def test_comments_and_layout_concern_nobody(module: str) -> None:
     assert changed_by(module, re.sub(r'"""[A-Z]', '"""Once more: ', text)) == set()
 
 
+@outside_ci
 def test_in_a_copy_a_comment_concerns_nobody_and_a_constant_those_that_reach_it(tmp_path: Path) -> None:
     """What `benchmarks/what_reruns.py` shows of nights, by the digests alone."""
     package = what_reruns.copy_package(tmp_path)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from history_rows import lead, rows
+from outside_ci import outside_ci
 from report_rows import publish_fleet
 
 from fieldcal.batch.jobs import find_jobs
@@ -239,6 +240,7 @@ def test_hostile_rows_of_a_flight_are_text(tmp_path: Path) -> None:
         assert HOSTILE in sound(path).text
 
 
+@outside_ci
 def test_night_reports_are_linked_and_written_once(fleet: Path) -> None:
     paths = write_night_reports(fleet, ["step-1", "drifting-1"])
     page = sound(paths[0])

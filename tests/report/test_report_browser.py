@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser_support import WIDER_THAN_THE_WINDOW, browser, picture, show
+from outside_ci import outside_ci
 from report_rows import publish_fleet
 
 from fieldcal.flight.calibrate import identify, read, run_stages
@@ -73,6 +74,7 @@ def test_page_is_quiet_offline_and_drawn(browser: Any, pages: dict[str, Path], p
     assert browser.execute_script(WIDER_THAN_THE_WINDOW) <= 0
 
 
+@outside_ci
 @pytest.mark.parametrize("page", PLOTS)
 def test_light_and_dark_differ_in_colour_only(browser: Any, pages: dict[str, Path], page: str) -> None:
     pictures = {}

@@ -139,7 +139,8 @@ def filled(browser: Any, label: str, text: str) -> None:
 def test_a_hostile_name_is_a_name(browser: Any, site: Path, served: str, place: str) -> None:
     base = served if place == "server" else f"{site.as_uri()}/"
     show(browser, f"{base}flights.html#q=img")
-    (vehicle,) = browser.find_elements("css selector", "tbody td a")
+    until(lambda: len(browser.find_elements("css selector", "tbody td a")) == 1)
+    vehicle = browser.find_element("css selector", "tbody td a")
     name = vehicle.text
     assert name == HOSTILE.replace("\u202e", "\\u202e").replace("\x1b", "\\x1b")
     vehicle.click()

@@ -114,7 +114,7 @@ def known_by_names(dialect: Dialect, csv: CsvMap) -> set[str]:
 
     known = {"imu"} if any(sensor in csv.imu or has_default(IMU_DEFAULTS[sensor]) for sensor in SENSORS) else set()
     attitude = has_default(VPS_DEFAULTS["quaternion_xyzw"]) or quaternion_by_names(dialect.names) is not None
-    timed = csv.rate_hz is not None or has_default(TIME_DEFAULTS)
+    timed = csv.rate_hz is not None or any(name in dialect.names for name in TIME_DEFAULTS)  # of formats, with a unit
     return known | ({"vps"} if csv.vps or (attitude and timed) else set())
 
 
