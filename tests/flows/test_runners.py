@@ -62,6 +62,7 @@ def test_a_dask_cluster_gives_the_same(archive: Path, content: str, tmp_path: Pa
     assert list(worked.values()) == [True, True]
 
 
+@outside_ci
 def test_every_stage_of_a_batch_is_a_task_of_the_night_in_two_processes(
     archive: Path, content: str, tmp_path: Path, prefect_server: str
 ) -> None:

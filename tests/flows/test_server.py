@@ -146,6 +146,7 @@ def flow_runs(url: str) -> dict[str, str]:
         return {str(run.id): str(run.state_type.value) for run in client.read_flow_runs() if run.state_type}
 
 
+@outside_ci
 def test_a_killed_run_is_ended_at_the_next_start(archive: Path, tmp_path: Path, prefect_server: str) -> None:
     root = tmp_path / "warehouse"
     process = subprocess.Popen(

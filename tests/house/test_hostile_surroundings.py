@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from outside_ci import outside_ci
 
 from fieldcal.batch.flights import one_flight
 from fieldcal.batch.jobs import find_jobs
@@ -159,6 +160,7 @@ sys.exit(run(["nightly", sys.argv[2], "--warehouse", sys.argv[3]]))
 """
 
 
+@outside_ci
 def test_a_full_disk_ends_the_night_with_a_sentence(
     grown: tuple[Path, Path, dict[str, Any]], prefect_server: str
 ) -> None:

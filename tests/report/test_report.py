@@ -191,6 +191,7 @@ def test_vehicle_shows_refused_values_and_why(fleet: Path) -> None:
     assert "the residual is 4.1 % of the field: a magnet came near." in page.text
 
 
+@outside_ci
 def test_pages_do_not_depend_on_the_session(fleet: Path, tmp_path: Path) -> None:
     """Hash seed, time zone and the user's own matplotlib settings change no byte."""
     (tmp_path / "matplotlibrc").write_text(
