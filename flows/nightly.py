@@ -150,9 +150,9 @@ def told_apart(result: NightDocument) -> NightDocument:
     failed = [log for log in result["logs"] if any(own["status"] == Status.FAILED for own in log["refusals"])]
     if not failed:
         return result
-    reasons = [f"{log['log_uri']}: {log['reason']}" for log in failed]
+    first = f"{failed[0]['log_uri']}: {failed[0]['reason']}"
     more = f" … and {len(failed) - 1} more" if len(failed) > 1 else ""
-    told = f"Stages of {len(failed)} of {len(result['logs'])} logs failed; the rest is published. {reasons[0]}{more}"
+    told = f"Stages of {len(failed)} of {len(result['logs'])} logs failed; the rest is published. {first}{more}"
     return cast(NightDocument, Failed(message=printable(told)))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import polars as pl
 
 from fieldcal import schemas
-from fieldcal.warehouse.layout import history_files
+from fieldcal.warehouse.layout import history_files, vehicle_name
 from fieldcal.warehouse.rows_as_json import column_bytes
 from fieldcal.warehouse.store import read_table
 
@@ -30,7 +30,7 @@ def content_sha256(root: Path) -> str:
         for folder in folders:
             rows = pl.concat([read_table(path, table) for path in folders[folder]])
             if rows.height:
-                digest.update(f"{table}\0vehicle_id={folder.name.partition('=')[2]}\0{rows.height}\0".encode())
+                digest.update(f"{table}\0vehicle_id={vehicle_name(folders[folder][0])}\0{rows.height}\0".encode())
                 digest.update(rows_sha256(rows, table))
     return digest.hexdigest()
 

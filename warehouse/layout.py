@@ -112,11 +112,9 @@ def vehicle_of(path: Path) -> str | None:
     return decode_id(vehicle_name(path))
 
 
-def twin(path: Path) -> Path:
-    """Where a file of the history lay or will lie: an upgrade that moves it records it in both places for a moment."""
-    key, _, name = path.parent.name.partition("=")
-    other = {PARTITION: FORMER_PARTITION, FORMER_PARTITION: PARTITION}.get(f"{key}=", f"{key}=")
-    return path.parent.with_name(f"{other}{name}") / path.name
+def under(prefix: str, path: Path) -> Path:
+    """Where a file of the history lies whose folders are named by `prefix`."""
+    return path.parent.with_name(prefix + vehicle_name(path)) / path.name
 
 
 def vehicle_name(path: Path) -> str:

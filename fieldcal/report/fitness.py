@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -33,6 +33,17 @@ class Fitness:
     vehicle_id: str
     standing: Standing
     reasons: tuple[str, ...] = ()
+
+    def why(self, most: int) -> str:
+        """The gravest reasons, and how many others there are; "" where it is fine."""
+        more = len(self.reasons) - most
+        return " ".join(self.reasons[:most]) + (f" (and {more} more)" if more > 0 else "")
+
+
+def ranked(fleet: Mapping[str, Fitness]) -> list[Fitness]:
+    """What needs a look first."""
+    order = list(Standing)
+    return sorted(fleet.values(), key=lambda one: (order.index(one.standing), one.vehicle_id))
 
 
 def fleet_fitness(

@@ -9,7 +9,7 @@ import polars as pl
 from markupsafe import Markup
 
 from fieldcal.names import Json, Standing, Status, Verdict, exactness
-from fieldcal.report.fitness import Fitness
+from fieldcal.report.fitness import Fitness, ranked
 from fieldcal.report.history import UsableFlight, newest, usable_flights
 from fieldcal.report.key_parameter import key_parameters
 from fieldcal.report.links import Links, flight_name, vehicle_name
@@ -37,12 +37,11 @@ def fleet_page(warehouse: Warehouse, fitness: Mapping[str, Fitness], links: Link
     sparks = key_parameters(warehouse, flown, trends)
     last = {row["vehicle_id"]: row for row in typed(usable_flights(warehouse).iter_rows(named=True), UsableFlight)}
     of = {str(key[0]): part for key, part in flights.partition_by("vehicle_id", as_dict=True).items()}
-    order = list(Standing)
-    ranked = sorted(fitness.values(), key=lambda one: (order.index(one.standing), one.vehicle_id))
     rows = [
-        _row(one, of[one.vehicle_id], last.get(one.vehicle_id), sparks.get(one.vehicle_id), links) for one in ranked
+        _row(one, of[one.vehicle_id], last.get(one.vehicle_id), sparks.get(one.vehicle_id), links)
+        for one in ranked(fitness)
     ]
-    counts = {standing: sum(one.standing == standing for one in ranked) for standing in Standing}
+    counts = {standing: sum(one.standing == standing for one in fitness.values()) for standing in Standing}
     verdicts = dict(flights.group_by("verdict").len().iter_rows())
     moment = newest(warehouse)
     facts = [
@@ -80,12 +79,10 @@ def _row(
 ) -> Sequence[str]:
     latest = typed([flights.row(-1, named=True)], FlightRow)[0]
     text, drawn = spark or ("–", "")
-    more = len(one.reasons) - SHOWN_REASONS
-    why = " ".join(one.reasons[:SHOWN_REASONS]) + (f" (and {more} more)" if more > 0 else "")
     return [
         links.to(vehicle_name(one.vehicle_id), one.vehicle_id),
         badge(one.standing),
-        why or "–",
+        one.why(SHOWN_REASONS) or "–",
         "none" if last is None else Markup("{}{}").format(_linked(last, links), _ago(last["started_at"])),
         str(flights.height),
         str(latest["imu_id"]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import http.server
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, cast
@@ -37,7 +37,7 @@ def log(verdict: str, log_uri: str, stages_run: int = 19, reason: str | None = "
     return {"log_uri": log_uri, "verdict": verdict, "reason": reason, "stages_run": stages_run}
 
 
-def night(changes: list[dict[str, Any]] = [], logs: list[dict[str, Any]] = []) -> NightDocument:  # noqa: B006
+def night(changes: Sequence[dict[str, Any]] = (), logs: Sequence[dict[str, Any]] = ()) -> NightDocument:
     counts = {name: sum(one["verdict"] == name for one in logs) for name in ("ok", "partial", "no_result")}
     rest = {"quarantined": 0, "rejected": 0, "report": "w/reports/fleet.html"}
     return cast(NightDocument, {**counts, **rest, "changes": changes, "logs": logs})

@@ -141,13 +141,13 @@ def _select(table: str, paths: Sequence[Path], absent: Collection[str]) -> str:
     """
     keys = {path.parent.name.partition("=")[0] for path in paths}
     by_folder = len(keys) == 1 and all(vehicle_of(path) for path in paths)
-    how, own = "hive_partitioning = false", dict.fromkeys(schemas.TABLES[table].column_names, "")
+    how, columns = "hive_partitioning = false", {name: f'f."{name}"' for name in schemas.TABLES[table].column_names}
     if by_folder:
         (key,) = keys
         how = f"hive_partitioning = true, hive_types = {{'{key}': 'VARCHAR'}}"
-        own["vehicle_id"] = f'f."{key}" AS "vehicle_id"'
-    columns = ", ".join(_younger(table, n) if n in absent else known or f'f."{n}"' for n, known in own.items())
-    return f"SELECT {columns} FROM read_parquet({_listed(paths)}, {how}) AS f"
+        columns["vehicle_id"] = f'f."{key}" AS "vehicle_id"'
+    columns |= {name: _younger(table, name) for name in columns if name in absent}
+    return f"SELECT {', '.join(columns.values())} FROM read_parquet({_listed(paths)}, {how}) AS f"
 
 
 def _younger(table: str, name: str) -> str:

@@ -24,7 +24,7 @@ from fieldcal.warehouse.layout import (
     PARTITION,
     checksum_path,
     history_files,
-    vehicle_name,
+    under,
     vehicle_of,
 )
 from fieldcal.warehouse.lock import vehicle_lock
@@ -89,11 +89,6 @@ def upgrade(root: Path, *, dry_run: bool = False, timeout_s: float = 300.0) -> U
     return {"ok": all(outcome["status"] != "left" for outcome in told), "files": len(files), "upgraded": told}
 
 
-def _todays(path: Path) -> Path:
-    """Where a file of the history lies by today's names."""
-    return path.parent.with_name(PARTITION + vehicle_name(path)) / path.name
-
-
 def _rename(root: Path, former: Path, path: Path) -> None:
     """Give a file's folder today's name. What was recorded of the file is there under both names for a moment."""
     records = checksum_path(root, former).parent
@@ -113,11 +108,11 @@ def _remove_former_records(root: Path) -> None:
 
 def _upgraded(root: Path, table: str, path: Path, dry_run: bool, timeout_s: float) -> FileUpgrade | None:
     """What became of one file; None where it is of today's version."""
-    known = TABLES[table].version
+    known, place = TABLES[table].version, under(PARTITION, path)
     outcome: FileUpgrade = {
         "table": table,
         "vehicle_id": vehicle_of(path) or path.parent.name,
-        "path": str(_todays(path).relative_to(root)),
+        "path": str(place.relative_to(root)),
         "status": "due" if dry_run else "upgraded",
         "from_version": None,
         "to_version": known,
@@ -126,7 +121,7 @@ def _upgraded(root: Path, table: str, path: Path, dry_run: bool, timeout_s: floa
     }
     try:
         version, rows = _read(root, table, path)
-        moves = path != _todays(path)
+        moves = path != place
         if version == known and not moves:
             return None
         ids = rows["vehicle_id"].unique().to_pylist()
@@ -138,7 +133,7 @@ def _upgraded(root: Path, table: str, path: Path, dry_run: bool, timeout_s: floa
                 if version != known:
                     write_bytes(path, table_bytes(rows, table), partial(checksums.recording, root, path))
                 if moves:
-                    _rename(root, path, _todays(path))
+                    _rename(root, path, place)
     except WarehouseError as error:
         if error.reason_code not in (ReasonCode.DAMAGED_FILE, ReasonCode.SCHEMA_MISMATCH):
             raise

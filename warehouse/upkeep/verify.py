@@ -13,7 +13,7 @@ from fieldcal.warehouse import checksums
 from fieldcal.warehouse.content import content_sha256
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import TEMPORARY, file_sha256
-from fieldcal.warehouse.layout import SITE, history_files, twin
+from fieldcal.warehouse.layout import FORMER_PARTITION, PARTITION, SITE, history_files, under
 from fieldcal.warehouse.sealed import BrokenSeal, unseal
 from fieldcal.warehouse.stage_store import RECORD, broken_outputs, outputs_of
 from fieldcal.warehouse.store import read_table
@@ -87,13 +87,19 @@ def _recorded_files(root: Path) -> Iterator[Problem]:
         root / path.relative_to(records).with_name(path.name.removesuffix(".json")) for path in records.rglob("*.json")
     }
     for path in sorted(paths):
-        if not path.exists() and path.is_relative_to(root / "tables") and twin(path).exists():
+        if path.is_relative_to(root / "tables") and not path.exists() and _moved(path):
             continue
         try:
             sha256 = file_sha256(path) if path.exists() else None
             yield str(path.relative_to(root)), checksums.problem(root, path, sha256)
         except WarehouseError as error:
             yield str(path.relative_to(root)), error.sentence
+
+
+def _moved(path: Path) -> bool:
+    """Whether a file of the history lies under its folder's other name: an upgrade records it under both for a
+    moment."""
+    return under(PARTITION, path).exists() or under(FORMER_PARTITION, path).exists()
 
 
 def _kept(path: Path) -> bool:

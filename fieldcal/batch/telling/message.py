@@ -51,17 +51,17 @@ def news_of(night: NightDocument, archive: Path, link: str | None = None) -> Mes
         lines += ["", "Fine again:", *_some([change["sentence"] for change in good], MOST_LOGS, "fieldcal drift")]
     report = f"{link.rstrip('/')}/{Path(night['report']).name}" if link else night["report"]
     lines += ["", f"Report: {report}"]
-    return Message(_title(archive, by_vehicle, logs), printed(lines))
+    return Message(_title(archive, by_vehicle, logs), _printed(lines))
 
 
 def failure_of(error: Exception, archive: Path) -> Message:
     """That a night ended early, and why."""
     why = getattr(error, "sentence", None) or f"{type(error).__name__}: {error}"
     told = "What it had done is kept; the next night goes on from there."
-    return Message(printable(f"fieldcal, {archive.name}: the night failed"), printed([why, told]))
+    return Message(printable(f"fieldcal, {archive.name}: the night failed"), _printed([why, told]))
 
 
-def printed(lines: Sequence[str]) -> str:
+def _printed(lines: Sequence[str]) -> str:
     """Lines of a message, whatever is in a name."""
     return "\n".join(printable(line) for line in lines).strip() + "\n"
 

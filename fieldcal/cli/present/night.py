@@ -13,7 +13,7 @@ from fieldcal.batch.outcome import cause, verdict_counts
 from fieldcal.cli.show import table
 from fieldcal.logs.unread import Unread, told
 from fieldcal.names import Standing, Verdict
-from fieldcal.report.fitness import fleet_fitness, remembered_alerts
+from fieldcal.report.fitness import fleet_fitness, ranked, remembered_alerts
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.flights import is_consequence
 from fieldcal.words.numbers import number
@@ -63,22 +63,12 @@ def print_fleet(console: Console, root: Path) -> None:
         return
     fine = sum(one.standing == Standing.FINE for one in fleet.values())
     console.print(f"Fleet: {fine} of {len(fleet)} vehicles fine to fly", markup=False)
-    order = list(Standing)
-    others = sorted(
-        (one for one in fleet.values() if one.standing != Standing.FINE),
-        key=lambda one: (order.index(one.standing), one.vehicle_id),
-    )
+    others = [one for one in ranked(fleet) if one.standing != Standing.FINE]
     if others:
-        lines = [[one.vehicle_id, one.standing, _first(one.reasons)] for one in others[:VEHICLES]]
+        lines = [[one.vehicle_id, one.standing, one.why(1)] for one in others[:VEHICLES]]
         console.print(table(["vehicle", "standing", "why"], lines))
         if len(others) > VEHICLES:
             console.print(f"  … and {len(others) - VEHICLES} more: the site's first page", markup=False)
-
-
-def _first(reasons: Sequence[str]) -> str:
-    """The gravest reason, and how many others there are."""
-    more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
-    return f"{reasons[0]}{more}" if reasons else ""
 
 
 def _refusals(log: LogEntry) -> list[list[str]]:
