@@ -30,7 +30,7 @@ from threadpoolctl import threadpool_limits
 from fieldcal.estimation.normal_equations import Name, NormalEquations
 from fieldcal.estimation.pooled.unit import Flight, Unit, pool, strengths
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import SENSORS
+from fieldcal.names import SENSORS, Sensor
 from fieldcal.simulation.archive import settings, signals
 from fieldcal.simulation.experiment import Experiment, simulate
 from fieldcal.stages.joint.information import equations_of
@@ -130,10 +130,11 @@ def led(rows: pl.DataFrame, vehicle: int, flight: int, session: int, day: float)
 def one_flight(task: tuple[int, int, int, float, Experiment]) -> tuple[pl.DataFrame, pl.DataFrame]:
     vehicle, flight, session, day, e = task
     tables = flown(e)
-    return tuple(  # type: ignore[return-value]
-        led(tables[name], vehicle, flight, session, day) if name in tables else empty_frame(name)
-        for name in ("information", "calibration")
-    )
+
+    def of(name: str) -> pl.DataFrame:
+        return led(tables[name], vehicle, flight, session, day) if name in tables else empty_frame(name)
+
+    return of("information"), of("calibration")
 
 
 def fleet(vehicles: int, flights: int, per_session: int = 2, jobs: int = 1, seed: int = 0) -> tuple[Any, ...]:
@@ -277,10 +278,10 @@ def cost(units: int, count: int) -> None:
     for vehicle in range(units):
         rng = np.random.default_rng([7, vehicle])
         unit = drawn(rng, count // 4)
-        of_unit = {sensor: (unit_, unit_) for sensor, unit_ in UNITS.items()}
+        of_unit = {Sensor(sensor): (unit_, unit_) for sensor, unit_ in UNITS.items()}
         flights_ = [f for f in unit.flights for _ in range(4)]
         for k, flight in enumerate(flights_):
-            own = rows_of_equations(flight.equations, [None] * 18, of_unit)  # type: ignore[arg-type]
+            own = rows_of_equations(flight.equations, [None] * 18, of_unit)
             own = own.with_columns(temperature_degc=pl.lit(25.0 + float(flight.warmth_degc or 0.0)))
             rows.append(led(own, vehicle, k, flight.session, unit.day[flight.session]))
     information = pl.concat(rows)

@@ -12,7 +12,8 @@ from fieldcal.warehouse.sql import empty_table
 from fieldcal.warehouse.views import AT, VIEWS, view_text
 
 MEANINGS = {
-    "source": "where the value comes from: drift (the unit's trend), flight (the latest that was not refused)",
+    "source": "where the value comes from: drift (the unit's trend), flight (the latest that was not refused), pooled "
+    "(all of the unit's flights together)",
     "why": "why this value, as a sentence",
     "drift_status": "status of the trend in table drift",
     "temperature_from_degc": "lower end of the 5 °C interval",

@@ -27,6 +27,17 @@ class NormalEquations:
     right: Array
     information: Array
 
+    @classmethod
+    def of_triangle(cls, names: Sequence[Name], reference: Array, right: Array, triangle: Array) -> NormalEquations:
+        """By the lower triangle of N, row by row, (p(p + 1)/2,)."""
+        lower = np.zeros((len(names), len(names)))
+        lower[np.tril_indices(len(names))] = triangle
+        return cls(tuple(names), reference, right, lower + np.tril(lower, -1).T)
+
+    def triangle(self) -> list[list[float]]:
+        """Rows of N up to their diagonal."""
+        return [row[: place + 1].tolist() for place, row in enumerate(self.information)]
+
     def of(self, names: Sequence[Name]) -> NormalEquations:
         """These parameters alone, in this order, whatever the others are: the Schur complement. An other one that is
         not determined itself takes with it what is known only beside it."""
@@ -51,14 +62,20 @@ class NormalEquations:
         root = vector * np.sqrt(np.maximum(value, 0.0))
         root = root[:, value > 0.0]
         seen = self.information @ root
-        across = np.linalg.solve(np.eye(root.shape[1]) + root.T @ seen, np.column_stack([seen.T, root.T @ self.right]))
-        information = self.information - seen @ across[:, :-1]
-        right = self.right - seen @ across[:, -1]
-        return replace(self, information=0.5 * (information + information.T), right=right)
+        information, right = after_errors(self.information, self.right, seen, root.T @ seen, root.T @ self.right)
+        return replace(self, information=information, right=right)
 
     def moved(self, reference: Array) -> NormalEquations:
         """The same about another point (p,)."""
         return replace(self, reference=reference, right=self.right + self.information @ (self.reference - reference))
+
+
+def after_errors(information: Array, right: Array, seen: Array, inner: Array, by: Array) -> tuple[Array, Array]:
+    """N (p, p) and g (p,) after independent errors of a covariance R Rᵀ were added to what they tell: (N⁻¹ + R Rᵀ)⁻¹ by
+    Woodbury, from N R `seen` (p, k), Rᵀ N R `inner` (k, k) and Rᵀ g `by` (k,)."""
+    solved = np.linalg.solve(np.eye(len(by)) + inner, np.column_stack([seen.T, by]))
+    n = information - seen @ solved[:, :-1]
+    return 0.5 * (n + n.T), right - seen @ solved[:, -1]
 
 
 def scaling(diagonal: Array) -> Array:

@@ -24,12 +24,12 @@ from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.questions import existing, units_flown
 from fieldcal.words.rows import typed
 
-_QUESTION = """
+CONSTANTS_OF_VEHICLE = """
 SELECT a.*, l.slope_per_degc, l.slope_per_degc_sd, l.curve_per_degc2, l.curve_per_degc3,
     l.temperature_min_degc, l.temperature_max_degc
 FROM calibration_at(?) AS a
 JOIN latest_calibration AS l USING (unit_id, sensor, parameter, axis)
-WHERE a.parameter IN ('scale', 'zero')
+WHERE a.parameter IN ('scale', 'zero') AND a.vehicle_id = ?
 """
 
 
@@ -79,7 +79,7 @@ def constants_of(
     """
     at = REFERENCE_DEGC if temperature_degc is None else float(temperature_degc)
     warehouse = warehouse or existing(root)
-    rows = warehouse.sql(_QUESTION, [at]).filter(pl.col("vehicle_id") == vehicle_id)
+    rows = warehouse.sql(CONSTANTS_OF_VEHICLE, [at, vehicle_id])
     units = rows["unit_id"].unique().sort().to_list()
     if rows.is_empty():
         known = warehouse.scan("calibration").select("vehicle_id").unique().sort("vehicle_id").collect()["vehicle_id"]

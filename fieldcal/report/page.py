@@ -122,21 +122,20 @@ class Page:
 
 def html(page: Page) -> str:
     """The page as one file that needs nothing else."""
-    up = None if page.up is None else {"href": page.up[0], "text": page.up[1]}
-    return (
-        environment()
-        .get_template("report.html")
-        .render(
-            title=page.title,
-            lead=page.lead,
-            facts=page.facts,
-            sections=page.sections,
-            footer=page.footer,
-            up=up,
-            version=fieldcal.__version__,
-            style=_style(),
-        )
-    )
+    return environment().get_template("report.html").render(**content(page), style=_style())
+
+
+def content(page: Page) -> dict[str, object]:
+    """What every template shows of a page."""
+    return {
+        "title": page.title,
+        "lead": page.lead,
+        "facts": page.facts,
+        "sections": page.sections,
+        "footer": page.footer,
+        "up": None if page.up is None else {"href": page.up[0], "text": page.up[1]},
+        "version": fieldcal.__version__,
+    }
 
 
 def badge(status: str | None) -> Markup:

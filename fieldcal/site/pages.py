@@ -11,8 +11,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-import fieldcal
-from fieldcal.report.page import Page, environment
+from fieldcal.report.page import Page, content, environment
 
 ASSETS = (
     "site.css",
@@ -50,7 +49,6 @@ def asset(name: str) -> bytes:
 
 def html(page: Page, frame: Frame) -> bytes:
     """A page of the site."""
-    up = None if page.up is None else {"href": page.up[0], "text": page.up[1]}
     charted = "charts.js" in frame.scripts
     scripts = (["uplot/uPlot.iife.min.js"] if charted else []) + list(frame.scripts)
     data = [f"{DATA}/{quote(name)}.js?v={_digest(text)}" for name, text in (frame.data or {}).items()]
@@ -58,13 +56,7 @@ def html(page: Page, frame: Frame) -> bytes:
         environment("fieldcal.site")
         .get_template("site.html")
         .render(
-            title=page.title,
-            lead=page.lead,
-            facts=page.facts,
-            sections=page.sections,
-            footer=page.footer,
-            up=up,
-            version=fieldcal.__version__,
+            **content(page),
             styles=[address(name) for name in (["uplot/uPlot.min.css"] if charted else []) + ["site.css"]],
             scripts=[address(name) for name in scripts],
             data=data,

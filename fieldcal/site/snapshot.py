@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Unpack
 
 import polars as pl
 
+from fieldcal.exports.calibration_at import CONSTANTS_OF_VEHICLE
 from fieldcal.report.history import REFUSALS_OF_VEHICLE
 from fieldcal.schemas import HISTORY_TABLES
 from fieldcal.warehouse import Warehouse
@@ -16,7 +17,11 @@ from fieldcal.warehouse import Warehouse
 if TYPE_CHECKING:
     from fieldcal.warehouse.sql import Limits, SqlValue
 
-_REFUSALS_OF_ALL = REFUSALS_OF_VEHICLE.replace("vehicle_id = ? AND ", "")
+OF_ALL = {
+    REFUSALS_OF_VEHICLE: REFUSALS_OF_VEHICLE.replace("vehicle_id = ? AND ", ""),
+    CONSTANTS_OF_VEHICLE: CONSTANTS_OF_VEHICLE.replace(" AND a.vehicle_id = ?", ""),
+}
+"""What is asked of one vehicle, the last parameter → the same of all."""
 
 
 class Snapshot(Warehouse):
@@ -43,8 +48,8 @@ class Snapshot(Warehouse):
 
     def sql(self, query: str, parameters: Sequence[SqlValue] | None = None, **limits: Unpack[Limits]) -> pl.DataFrame:
         """As `Warehouse.sql`; what each vehicle's page asks is asked of the whole fleet at once."""
-        if query == REFUSALS_OF_VEHICLE and parameters:
-            return self.sql(_REFUSALS_OF_ALL, **limits).filter(pl.col("vehicle_id") == parameters[0])
+        if query in OF_ALL and parameters:
+            return self.sql(OF_ALL[query], parameters[:-1], **limits).filter(pl.col("vehicle_id") == parameters[-1])
         key = (query, tuple(parameters or ()))
         if key not in self._answers:
             self._answers[key] = super().sql(query, parameters, **limits)

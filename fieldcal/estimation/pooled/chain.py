@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fieldcal.estimation.normal_equations import scaling
+from fieldcal.estimation.normal_equations import after_errors, scaling
 from fieldcal.geometry.rotation import Array
 
 UNSEEN = 1e-9
@@ -50,10 +50,7 @@ class Known:
             return Known(n, g)
         root = np.sqrt(variance[at])
         seen = n[:, at] * root
-        inner = np.eye(len(at)) + root[:, None] * seen[at]
-        solved = np.linalg.solve(inner, np.column_stack([seen.T, root * g[at]]))
-        n = n - seen @ solved[:, :-1]
-        return Known(0.5 * (n + n.T), g - seen @ solved[:, -1])
+        return Known(*after_errors(n, g, seen, root[:, None] * seen[at], root * g[at]))
 
     def estimate(self) -> Estimate:
         """The state and its covariance; infinite variance of what is not determined."""

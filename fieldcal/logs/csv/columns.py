@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -77,16 +78,17 @@ def find_columns(
         `missing_column`, `duplicate_column`.
     """
     values = {}
+    written = default_names(dialect.names)
     for key, default in defaults.items():
         wanted = configured.get(key)
         names = (wanted,) if isinstance(wanted, str) else tuple(wanted or default)
         if not wanted:
-            names = tuple(_as_written(name, dialect) for name in names)
+            names = tuple(written.get(name, name) for name in names)
         if wanted or any(name in dialect.names for name in names):
             values[key] = tuple(_position(name, dialect, f"csv.{table}.{key}", log_name) for name in names)
     if configured.get("t"):
         return Columns(_position(str(configured["t"]), dialect, f"csv.{table}.t", log_name), values)
-    times = [own for name in TIME_DEFAULTS if (own := _as_written(name, dialect)) in dialect.names]
+    times = [written[name] for name in TIME_DEFAULTS if name in written]
     return Columns(_position(times[0], dialect, f"csv.{table}.t", log_name) if times else None, values)
 
 
@@ -109,8 +111,10 @@ def signal_groups(
 def known_by_names(dialect: Dialect, csv: CsvMap) -> set[str]:
     """Tables ("imu", "vps") that default or configured names tell: a sensor, or an attitude and its time."""
 
+    written = default_names(dialect.names)
+
     def has_default(names: Sequence[str]) -> bool:
-        return any(_as_written(name, dialect) in dialect.names for name in names)
+        return any(name in written for name in names)
 
     known = {"imu"} if any(sensor in csv.imu or has_default(IMU_DEFAULTS[sensor]) for sensor in SENSORS) else set()
     attitude = has_default(VPS_DEFAULTS["quaternion_xyzw"]) or quaternion_by_names(dialect.names) is not None
@@ -183,11 +187,13 @@ def declared_units(dialect: Dialect, columns: Columns, summary: LogSummary, log_
     return units
 
 
-def _as_written(name: str, dialect: Dialect) -> str:
-    """The column that a default name means: itself, else the one that is it with a unit in brackets. Of two of these
-    neither is meant."""
-    with_unit = [own for own in dialect.names if without_unit(own) == name]
-    return with_unit[0] if name not in dialect.names and len(with_unit) == 1 else name
+def default_names(names: Sequence[str]) -> dict[str, str]:
+    """Default name → the column that it means: of that name, else the one that is it with a unit in brackets. Of two of
+    these neither is meant."""
+    bare = [without_unit(name) for name in names]
+    times = Counter(bare)
+    with_unit = {name: own for name, own in zip(bare, names, strict=True) if times[name] == 1}
+    return with_unit | {name: name for name in names}
 
 
 def _position(name: str, dialect: Dialect, key: str, log_name: str) -> int:

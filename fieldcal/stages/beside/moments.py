@@ -98,14 +98,19 @@ def _vector_moments(tables: Tables, sensor: Sensor) -> tuple[Moments, float] | N
     t_ns, values = t_ns[new], values[new]
     if len(values) < 2:
         return None
-    interval_ns = float(np.median(np.diff(t_ns)))
-    rate_hz = 1e9 / interval_ns if interval_ns > 0 else 0.0
+    interval_ns, rate_hz = _rate(t_ns)
     moments = Moments(in_mean=readings_in_mean(rate_hz))
     late = np.flatnonzero(np.diff(t_ns) > GAP * interval_ns) + 1
     for a, b in zip([0, *late], [*late, len(values)], strict=True):
         moments.feed(values[a:b])
         moments.gap()
     return moments, rate_hz
+
+
+def _rate(t_ns: np.ndarray) -> tuple[float, float]:
+    """Median interval of stamps (n,), ns, and the rate, Hz; 0 where they stand."""
+    interval_ns = float(np.median(np.diff(t_ns)))
+    return interval_ns, 1e9 / interval_ns if interval_ns > 0 else 0.0
 
 
 def _rate_equations(tables: Tables, s: MomentsSettings) -> tuple[RateEquations, float] | None:
@@ -119,8 +124,7 @@ def _rate_equations(tables: Tables, s: MomentsSettings) -> tuple[RateEquations, 
     t_ns, segment = samples["t_ns"].to_numpy(), samples["segment"].to_numpy()
     if len(values) < 2 or np.isnan(values).all():
         return None
-    interval_ns = float(np.median(np.diff(t_ns)))
-    rate_hz = 1e9 / interval_ns if interval_ns > 0 else 0.0
+    interval_ns, rate_hz = _rate(t_ns)
     equations = RateEquations(
         block_samples_at(rate_hz), in_mean=readings_in_mean(rate_hz), max_gap_us=GAP * interval_ns * 1e-3
     )

@@ -116,6 +116,7 @@ def table_of(
     found: NormalEquations, refused: Collection[ReasonCode | None], units: Mapping[Sensor, tuple[str, str]]
 ) -> pl.DataFrame:
     """Rows, without a temperature; `units`: calibrated and logged of each sensor."""
+    triangle = found.triangle()
     rows = [
         {
             "place": place,
@@ -125,7 +126,7 @@ def table_of(
             "unit": _unit(name[1], *units[Sensor(name[0])]),
             "linearised_at": float(found.reference[place]),
             "right_side": float(found.right[place]),
-            "information": found.information[place, : place + 1].tolist(),
+            "information": triangle[place],
             "temperature_degc": None,
             "status": Status.OK if code is None else Status.REFUSED,
             "reason_code": code,
@@ -147,12 +148,9 @@ def _unit(parameter: str, calibrated: str, logged: str) -> str:
 def equations_of(rows: pl.DataFrame) -> NormalEquations:
     """Of the rows of one unit of a flight, in any order."""
     own = rows.sort("place")
-    p = own.height
-    lower = np.zeros((p, p))
-    lower[np.tril_indices(p)] = own["information"].explode().to_numpy()
-    names = tuple(own.select("sensor", "parameter", "axis").iter_rows())
-    information = lower + np.tril(lower, -1).T
-    return NormalEquations(names, own["linearised_at"].to_numpy(), own["right_side"].to_numpy(), information)
+    names = list(own.select("sensor", "parameter", "axis").iter_rows())
+    numbers = (own["linearised_at"], own["right_side"], own["information"].explode())
+    return NormalEquations.of_triangle(names, *(column.to_numpy() for column in numbers))
 
 
 def kept(rows: pl.DataFrame, names: Collection[Name]) -> pl.DataFrame:
@@ -174,7 +172,7 @@ def rewritten(rows: pl.DataFrame, found: NormalEquations) -> pl.DataFrame:
     )
     new = names.with_columns(
         **{name: pl.Series(column) for name, column in values.items()},
-        information=pl.Series([found.information[i, : i + 1].tolist() for i in range(len(found.names))]),
+        information=pl.Series(found.triangle()),
     )
     same = rows.select("sensor", "parameter", "axis", "unit", "temperature_degc", "status", "reason_code")
     return new.join(same, on=["sensor", "parameter", "axis"], how="left", maintain_order="left").select(list(SCHEMA))
@@ -197,7 +195,7 @@ def of_raw(
     crossed = [(i, j, place) for (i, j), place in crosses.items() if place is not None]
     for i, j, place in crossed:
         mix[i, j] = found.reference[place]
-    of_raw = mix @ matrix
+    product = mix @ matrix
     value, jacobian = found.reference.copy(), np.eye(len(found.names))
     doubt = np.zeros(len(found.names))
     for parameter, shift, sd in ((ZERO, offset, offset_sd), (SLOPE, per_degc, np.zeros(3))):
@@ -211,15 +209,15 @@ def of_raw(
         jacobian[np.ix_(nine, nine)] = np.kron(inverse, np.eye(3))
         value[nine] = jacobian[np.ix_(nine, nine)] @ found.reference[nine]
     for i, axis in enumerate(AXES):
-        gain, own = at[GAIN, axis], of_raw[i, i]
+        gain, own = at[GAIN, axis], product[i, i]
         value[gain], jacobian[gain, gain] = found.reference[gain] / own, 1.0 / own
         doubt[gain] = (value[gain] * matrix_sd) ** 2
         for j in (j for k, j, _ in crossed if k == i):
             jacobian[gain, at[CROSS_AXIS, axis + AXES[j]]] = -found.reference[gain] * matrix[j, i] / own**2
     for i, j, place in crossed:
-        value[place] = of_raw[i, j] / of_raw[i, i]
+        value[place] = product[i, j] / product[i, i]
         doubt[place] = matrix_sd**2
         for k, other in ((k, p) for n, k, p in crossed if n == i):
-            jacobian[place, other] = matrix[k, j] / of_raw[i, i] - of_raw[i, j] * matrix[k, i] / of_raw[i, i] ** 2
+            jacobian[place, other] = matrix[k, j] / product[i, i] - product[i, j] * matrix[k, i] / product[i, i] ** 2
     changed = found.as_function(found.names, value, jacobian)
     return changed.doubted(np.diag(doubt)) if doubt.any() else changed

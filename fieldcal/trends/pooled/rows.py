@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from fieldcal.names import DriftStatus, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.columns import LEAD
 from fieldcal.schemas.reference import REFERENCE_DEGC
-from fieldcal.trends.pooled.units import HistoryUnit
+from fieldcal.trends.pooled.units import DAY, EPOCH, HistoryUnit
 
 INFORMED_SHARE = 0.5
 """Of what is known of a zero before any flight: one that is not known better is refused, as a flight's is."""
@@ -199,4 +199,4 @@ def _sentence(found: Pooled, place: int, shares: Array, left_out: list[str]) -> 
 def _moment(day: float, one: HistoryUnit) -> datetime | None:
     if one.last["started_at"] is None:
         return None
-    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=round(float(day) * 86_400_000_000))
+    return EPOCH + timedelta(microseconds=round(float(day) * (DAY / timedelta(microseconds=1))))

@@ -97,13 +97,10 @@ def _unit(rows: pl.DataFrame) -> HistoryUnit | None:
 
 def _usable(rows: list[InformationRow], ids: Mapping[str, str], zero_units: Mapping[str, str]) -> NormalEquations:
     """A flight's equations of what counts: neither refused nor withdrawn, of the sensors that there are now."""
-    p = len(rows)
-    lower = np.zeros((p, p))
-    for place, row in enumerate(rows):
-        lower[place, : place + 1] = row["information"]
-    names = tuple((row["sensor"], row["parameter"], row["axis"]) for row in rows)
+    names = [(row["sensor"], row["parameter"], row["axis"]) for row in rows]
     reference, right = (np.array([row[column] for row in rows]) for column in ("linearised_at", "right_side"))
-    found = NormalEquations(names, reference, right, lower + np.tril(lower, -1).T)
+    triangle = np.concatenate([row["information"] for row in rows])
+    found = NormalEquations.of_triangle(names, reference, right, triangle)
     of_zero = {row["sensor"]: row["unit"] for row in rows if row["parameter"] == "zero"}
     counts = [
         name
@@ -112,7 +109,7 @@ def _usable(rows: list[InformationRow], ids: Mapping[str, str], zero_units: Mapp
         and row["sensor_unit_id"] == ids[name[0]]
         and of_zero.get(name[0]) == zero_units.get(name[0])
     ]
-    return found if len(counts) == p else found.of(counts)
+    return found if len(counts) == len(rows) else found.of(counts)
 
 
 def _often(flights: list[NormalEquations]) -> set[Name]:
