@@ -7,12 +7,15 @@ Three sets of one doublet per axis, MEMS triads behind a two-pole 50 Hz band lim
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from numpy.random import Generator
 
-from fieldcal.geometry.rotation import Array, body_from_inertial, from_euler, from_rotation_vector, multiply, normalise
+from fieldcal.geometry.rotation import Array, body_from_inertial, from_rotation_vector, multiply, normalise
 from fieldcal.names import SENSORS
+from fieldcal.simulation.flown import Flown, FlownMotion
+from fieldcal.simulation.motion import Kinematics, sinusoids, total
 
 TICK_S = 25.6e-6
 BAND_LIMIT_HZ = 50.0
@@ -32,6 +35,8 @@ BIAS = {
     "gyroscope": (7.0283, -9.6219, -11.728),
 }
 MID_SCALE = 32768.0
+RANGE = {"magnetometer": 8.0, "accelerometer": 160.0, "gyroscope": 35.0}
+"""Of what logs units, in them: 16 g and 2000 °/s."""
 BLOCK = 65_536
 """Samples of the motion evaluated at once: a record of an hour has thousands of doublets, of which each meets few."""
 
@@ -40,8 +45,13 @@ BLOCK = 65_536
 class Experiment:
     """What to simulate. Every default is the paper's experiment; units are in the names.
 
-    `scale` and `bias` map a sensor to its constants at 25 °C. Temperature: λ(T) = λ (1 + c_s ΔT), and the value at
-    mid-scale (32768 counts) moves by c_b ΔT, ΔT = T − 25 °C.
+    `motion`: what is flown. `logged`: counts of 16-bit converters, or units (rad/s, m/s², norm) in steps of a signed
+    one with the ranges of RANGE. `scale` and `bias` map a sensor to its constants at 25 °C. Temperature: λ(T) =
+    λ (1 + c_s ΔT), and the value at mid-scale (32768 counts; 0 of a unit) moves by c_b ΔT, ΔT = T − 25 °C.
+
+    A satellite receiver of `gnss_rate_hz` (0: none) tells the velocity of its antenna at `gnss_arm_m` from the sensor,
+    body axes, as it was `gnss_lag_s` before the stamp, with errors of `gnss_sd_mps` level and vertical, the share
+    `gnss_colour` of their variance correlated over `gnss_colour_s`.
 
     Examples
     --------
@@ -50,6 +60,8 @@ class Experiment:
     """
 
     seed: int = 0
+    motion: Flown = Flown.MANOEUVRE
+    logged: Literal["counts", "si"] = "counts"
     duration_s: float = 40.0
     sets: int = 3
     rate_hz: float = 185.0
@@ -73,6 +85,7 @@ class Experiment:
     magnetic_bursts: int = 0
     burst_norm: float = 0.4
     noise: bool = True
+    noise_variance: dict[str, float] = field(default_factory=lambda: dict(NOISE_VARIANCE))
     quantisation: bool = True
     band_limit: bool = True
     vps: bool = True
@@ -82,6 +95,13 @@ class Experiment:
     vps_dropout_share: float = 0.0
     vps_outlier_share: float = 0.0
     vps_misalignment_rad: float = 0.0
+    gnss_rate_hz: float = 0.0
+    gnss_lag_s: float = 0.12
+    gnss_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gnss_sd_mps: tuple[float, float] = (0.10, 0.15)
+    gnss_colour: float = 0.0
+    gnss_colour_s: float = 2.0
+    gnss_outlier_share: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -91,7 +111,8 @@ class SimulatedFlight:
     Logged: `t` (n,) IMU stamps, s; `counts` sensor → (n, 3); `temperature` (n,) °C; `vps_t` (m,) s on the VPS clock;
     `vps_q` (m, 4) body to NED world; `vps_position` (m, 3) m; `current_a` (n,) A of the motors, or None.
     Truth: `q` (n, 4) and `rate` (n, 3) at t as the sensors saw them, i.e. `delay_s` late by the sensor filter; the two
-    constant VPS rotations.
+    constant VPS rotations. `gnss_t` (g,) s on the IMU's clock, `gnss_velocity` (g, 3) m/s NED, `gnss_sd` (g,) as the
+    receiver claims it: without one all are empty.
 
     Examples
     --------
@@ -112,6 +133,9 @@ class SimulatedFlight:
     delay_s: float
     vps_world_rotation: Array
     vps_body_rotation: Array
+    gnss_t: Array
+    gnss_velocity: Array
+    gnss_sd: Array
     current_a: Array | None = None
 
     def lag_at(self, imu_time_s: float) -> float:
@@ -120,12 +144,17 @@ class SimulatedFlight:
         return float(imu_time_s - ((imu_time_s - self.delay_s) * (1 + skew) + self.experiment.vps_offset_s))
 
     @property
+    def gnss_lag_s(self) -> float:
+        """By how much the receiver's velocity is later than the readings with its stamp: they are late too."""
+        return self.experiment.gnss_lag_s - self.delay_s
+
+    @property
     def lag_s(self) -> float:
         """Lag at the first IMU sample."""
         return self.lag_at(self.t[0])
 
 
-class Motion:
+class Motion(Kinematics):
     """Attitude, rate and translation in closed form: sums of doublets and sinusoids, evaluated at any time."""
 
     def __init__(self, experiment: Experiment, rng: Generator) -> None:
@@ -150,8 +179,8 @@ class Motion:
         self.starts = np.array(starts) * squeeze + 0.5 * (e.duration_s - clock * squeeze)
         self.lengths = np.array(lengths) * squeeze
         self.amplitudes = np.array(amplitudes)
-        self.tremor = _sinusoids(rng, e.tremor_rad / np.sqrt(3.0), (0.3, 1.5), lines=8)
-        self.translation = _sinusoids(rng, e.translation_rms_mps2 / np.sqrt(3.0), (0.3, 2.0), lines=6)
+        self.tremor = sinusoids(rng, e.tremor_rad / np.sqrt(3.0), (0.3, 1.5), lines=8)
+        self.translation = sinusoids(rng, e.translation_rms_mps2 / np.sqrt(3.0), (0.3, 2.0), lines=6)
 
     def euler(self, t: Array) -> tuple[Array, Array]:
         """Bank, pitch, heading (n, 3) and their derivatives at times t (n,)."""
@@ -170,60 +199,20 @@ class Motion:
         peak = 1.299038105676658  # of sin x − ½ sin 2x, at 2π/3
         shape = (np.sin(x) - 0.5 * np.sin(2 * x)) / peak
         slope = np.where(inside, (np.cos(x) - np.cos(2 * x)) / peak, 0.0) * 2 * np.pi / lengths
-        angle, angle_dot = self._sum(self.tremor, t, 0), self._sum(self.tremor, t, 1)
+        angle, angle_dot = total(self.tremor, t, 0), total(self.tremor, t, 1)
         return shape @ amplitudes + angle, slope @ amplitudes + angle_dot
-
-    @staticmethod
-    def _sum(lines: tuple[Array, Array, Array], t: Array, derivative: int) -> Array:
-        """Σ a sin(ωt + φ) per axis, differentiated (or integrated: negative) in time."""
-        amplitude, omega, phase = lines
-        shifted = np.multiply.outer(t, omega) + phase + 0.5 * np.pi * derivative
-        return np.asarray(np.sum(amplitude * omega**derivative * np.sin(shifted), axis=-1))
-
-    def attitude(self, t: Array) -> Array:
-        return from_euler(self.euler(t)[0])
-
-    def attitude_and_rate(self, t: Array) -> tuple[Array, Array]:
-        """Both for the price of one."""
-        angle, dot = self.euler(t)
-        return from_euler(angle), self._body_rate(angle, dot)
-
-    def rate(self, t: Array) -> Array:
-        """Body rates, rad/s."""
-        return self._body_rate(*self.euler(t))
-
-    @staticmethod
-    def _body_rate(angle: Array, dot: Array) -> Array:
-        """3-2-1 Euler kinematics."""
-        (sf, cf), (st, ct) = ((np.sin(angle[:, i]), np.cos(angle[:, i])) for i in (0, 1))
-        return np.stack(
-            [dot[:, 0] - st * dot[:, 2], cf * dot[:, 1] + sf * ct * dot[:, 2], -sf * dot[:, 1] + cf * ct * dot[:, 2]],
-            axis=1,
-        )
-
-    def rate_dot(self, t: Array) -> Array:
-        """Angular acceleration, rad/s², by a central difference of the closed form over 20 µs (error below 1e-8)."""
-        h = 1e-5
-        return (self.rate(t + h) - self.rate(t - h)) / (2 * h)
 
     def acceleration(self, t: Array) -> Array:
         """Translational acceleration of the centre of mass, m/s², NED."""
-        return self._sum(self.translation, t, 0) if np.any(self.translation[0]) else np.zeros((len(t), 3))
+        return total(self.translation, t, 0) if np.any(self.translation[0]) else np.zeros((len(t), 3))
+
+    def velocity(self, t: Array) -> Array:
+        """Velocity of the centre of mass, m/s, NED: the acceleration integrated."""
+        return total(self.translation, t, -1) if np.any(self.translation[0]) else np.zeros((len(t), 3))
 
     def position(self, t: Array) -> Array:
         """Position, m, NED: the acceleration integrated twice."""
-        return self._sum(self.translation, t, -2) if np.any(self.translation[0]) else np.zeros((len(t), 3))
-
-
-def _sinusoids(
-    rng: Generator, rms_per_axis: float, band_hz: tuple[float, float], *, lines: int
-) -> tuple[Array, Array, Array]:
-    """Amplitudes, angular frequencies (log-uniform in the band) and phases (3, lines), of given rms on each axis."""
-    low, high = np.log(band_hz)
-    omega = 2 * np.pi * np.exp(rng.uniform(low, high, size=(3, lines)))
-    amplitude = rng.uniform(0.5, 1.0, size=(3, lines))
-    amplitude *= rms_per_axis / np.sqrt(0.5 * np.sum(amplitude**2, axis=1, keepdims=True))
-    return amplitude, omega, rng.uniform(0, 2 * np.pi, size=(3, lines))
+        return total(self.translation, t, -2) if np.any(self.translation[0]) else np.zeros((len(t), 3))
 
 
 def simulate(experiment: Experiment | None = None, **changes: object) -> SimulatedFlight:
@@ -261,12 +250,14 @@ def simulate(experiment: Experiment | None = None, **changes: object) -> Simulat
     # Separate streams: switching one effect on or off leaves the others' draws alone.
     streams = dict(
         zip(
-            ("motion", "noise", "stamps", "bursts", "walk", "vps"),
-            (np.random.default_rng(s) for s in np.random.SeedSequence(e.seed).spawn(6)),
+            ("motion", "noise", "stamps", "bursts", "walk", "vps", "gnss"),
+            (np.random.default_rng(s) for s in np.random.SeedSequence(e.seed).spawn(7)),
             strict=True,
         )
     )
-    motion = Motion(e, streams["motion"])
+    drawn = streams["motion"]
+    by_hand = e.motion == Flown.MANOEUVRE
+    motion = Motion(e, drawn) if by_hand else FlownMotion(e.motion, e.duration_s, drawn)
     t = _stamps(e, streams["stamps"])
     delay_s = 2 * DAMPING / (2 * np.pi * BAND_LIMIT_HZ) if e.band_limit else 0.0
     temperature = np.interp(t, [0.0, e.duration_s], e.temperature_degc)
@@ -278,6 +269,7 @@ def simulate(experiment: Experiment | None = None, **changes: object) -> Simulat
     )
     vps_t, vps_q, vps_position = _vps(e, motion, streams["vps"], world, body)
     q, rate = motion.attitude_and_rate(t - delay_s)
+    gnss_t, gnss_velocity, gnss_sd = _gnss(e, motion, streams["gnss"])
     return SimulatedFlight(
         experiment=e,
         t=t,
@@ -291,6 +283,9 @@ def simulate(experiment: Experiment | None = None, **changes: object) -> Simulat
         delay_s=delay_s,
         vps_world_rotation=world,
         vps_body_rotation=body,
+        gnss_t=gnss_t,
+        gnss_velocity=gnss_velocity,
+        gnss_sd=gnss_sd,
     )
 
 
@@ -313,7 +308,7 @@ def _stamps(e: Experiment, rng: Generator) -> Array:
     return np.round(t / TICK_S) * TICK_S if e.quantisation else t
 
 
-def _sensed(e: Experiment, motion: Motion, t: Array, streams: dict[str, Generator]) -> dict[str, Array]:
+def _sensed(e: Experiment, motion: Kinematics, t: Array, streams: dict[str, Generator]) -> dict[str, Array]:
     """What the triads sense at stamps t, SI, gravity-signed, after the band limit and with noise."""
     oversampling = 8
     fine = t
@@ -347,7 +342,7 @@ def _sensed(e: Experiment, motion: Motion, t: Array, streams: dict[str, Generato
                 noise = _band_limited(noise, step)
                 noise /= np.sqrt(np.mean(noise[500:] ** 2))
         if noise is not None:
-            out[name] = out[name] + np.sqrt(NOISE_VARIANCE[name]) * noise
+            out[name] = out[name] + np.sqrt(e.noise_variance[name]) * noise
         if e.band_limit:
             from scipy.interpolate import CubicSpline
 
@@ -371,18 +366,22 @@ def constants_at(e: Experiment, sensor: str, temperature: Array | float) -> tupl
     warm = np.asarray(temperature, dtype=float)[..., None] - 25.0
     scale0, bias0 = np.array(e.scale[sensor]), np.array(e.bias[sensor])
     scale = scale0 * (1.0 + np.array(e.scale_per_degc.get(sensor, (0.0, 0.0, 0.0))) * warm)
-    middle = scale0 * MID_SCALE + bias0 + np.array(e.bias_per_degc.get(sensor, (0.0, 0.0, 0.0))) * warm
-    return scale, middle - scale * MID_SCALE
+    middle_reading = MID_SCALE if e.logged == "counts" else 0.0
+    middle = scale0 * middle_reading + bias0 + np.array(e.bias_per_degc.get(sensor, (0.0, 0.0, 0.0))) * warm
+    return scale, middle - scale * middle_reading
 
 
 def _counts(e: Experiment, sensor: str, sensed: Array, temperature: Array) -> Array:
     """Invert Eq. 5 and, unless switched off, round to 16-bit words."""
     scale, bias = constants_at(e, sensor, temperature)
     counts = (sensed - bias) / scale
+    if e.logged == "si":
+        step = RANGE[sensor] / MID_SCALE
+        return np.clip(step * np.rint(counts / step), -RANGE[sensor], RANGE[sensor]) if e.quantisation else counts
     return np.clip(np.rint(counts), 0, 65535) if e.quantisation else counts
 
 
-def _vps(e: Experiment, motion: Motion, rng: Generator, world: Array, body: Array) -> tuple[Array, Array, Array]:
+def _vps(e: Experiment, motion: Kinematics, rng: Generator, world: Array, body: Array) -> tuple[Array, Array, Array]:
     """VPS stamps (own clock), attitudes (body to its world) and positions (m, NED)."""
     if not e.vps:
         return np.empty(0), np.empty((0, 4)), np.empty((0, 3))
@@ -401,3 +400,23 @@ def _vps(e: Experiment, motion: Motion, rng: Generator, world: Array, body: Arra
         keep[(t >= start) & (t < start + rng.uniform(0.05, 0.5))] = False
     stamps = t * (1 + 1e-6 * e.vps_skew_ppm) + e.vps_offset_s
     return stamps[keep], q[keep], position[keep]
+
+
+def _gnss(e: Experiment, motion: Kinematics, rng: Generator) -> tuple[Array, Array, Array]:
+    """Stamps, velocities (g, 3) and claimed accuracies (g,) of the receiver."""
+    if e.gnss_rate_hz == 0.0:
+        return np.empty(0), np.empty((0, 3)), np.empty(0)
+    t = np.arange(rng.uniform(0.0, 1.0 / e.gnss_rate_hz), e.duration_s, 1.0 / e.gnss_rate_hz)
+    then = t - e.gnss_lag_s
+    turned = np.cross(motion.rate(then), np.array(e.lever_arm_m) + np.array(e.gnss_arm_m))
+    velocity = motion.velocity(then) + np.einsum("nji,nj->ni", body_from_inertial(motion.attitude(then)), turned)
+    sd = np.array([e.gnss_sd_mps[0], e.gnss_sd_mps[0], e.gnss_sd_mps[1]])
+    if e.noise:
+        white, slow = rng.normal(size=(2, len(t), 3))
+        keep = np.exp(-1.0 / (e.gnss_rate_hz * e.gnss_colour_s))
+        for k in range(1, len(t)):
+            slow[k] = keep * slow[k - 1] + np.sqrt(1.0 - keep**2) * slow[k]
+        velocity += sd * (np.sqrt(1.0 - e.gnss_colour) * white + np.sqrt(e.gnss_colour) * slow)
+    wrong = rng.uniform(size=len(t)) < e.gnss_outlier_share
+    velocity[wrong] += rng.normal(size=(int(wrong.sum()), 3)) * 5.0
+    return t, velocity, np.full(len(t), float(np.sqrt(np.mean(sd**2))))
