@@ -1,0 +1,380 @@
+"""All triads, attitude and velocity by a receiver's velocity: Gauss–Newton with noise levels estimated beside.
+
+Raises `no_velocity` … see `fit_by_velocity`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fieldcal.errors import EstimationError, UnusableFlight
+from fieldcal.estimation.by_velocity.equations import FIELD, GROUPS, LEVEL, PUSH, TURN, VERTICAL, Rows, Setting, Solved
+from fieldcal.estimation.by_velocity.equations import predicted, rows_of, solve
+from fieldcal.estimation.by_velocity.problem import (
+    LARGEST_LAG_S,
+    SMALLEST_LAG_S,
+    TRIADS,
+    Epochs,
+    Levels,
+    Prior,
+    State,
+    layout_of,
+    place_knots,
+)
+from fieldcal.estimation.by_velocity.start import attitudes, velocities_at_knots
+from fieldcal.estimation.by_velocity.strapdown import Grid, Integrated, grid_of, integrate
+from fieldcal.estimation.joint.problem import PriorConstants, Readings
+from fieldcal.estimation.segments import run_bounds
+from fieldcal.estimation.smoothing import fill, lattice
+from fieldcal.estimation.statistics import huber_inflation, huber_weights, power_density, robust_sigma
+from fieldcal.geometry.rotation import Array, from_rotation_vector, multiply
+from fieldcal.reason_codes import ReasonCode
+
+# What is known of a receiver beforehand.
+LAG_S, LAG_SD_S = 0.12, 0.15
+ARM_SD_M = 0.5
+# Of the field's dip and declination where its place is known: a model's error and a vehicle's steel; elsewhere.
+FIELD_SD_RAD, UNKNOWN_FIELD_SD_RAD = 0.03, 0.5
+UNKNOWN_SD_MPS = 0.3  # of a velocity of which the receiver does not say
+LEAST_SD_MPS = 0.02
+FEWEST_EPOCHS = 50
+MOST_ITERATIONS = 40
+# Converged: no constant moves by more than this share of its sd, no level by more than that share.
+CONVERGED_SD, CONVERGED_LEVEL = 0.03, 0.03
+# A walk's density over that which the triad's noise makes: at the start, where attitudes are wrong by more than noise;
+# it is 1 at least. Logarithm of the factor by which a level may change in an iteration.
+START_RATIO, LARGEST_LOG_STEP = 30.0, 1.5
+LEAST_TURN, LEAST_PUSH = 1e-10, 1e-8
+# Band in which readings are noise, not motion, Hz, and parts whose spectra are averaged, s.
+NOISE_HZ, SPECTRUM_S = (10.0, 40.0), 4.0
+LARGEST_TURN_RAD, LARGEST_LAG_STEP_S = 0.5, 0.05
+# Longest correlation that a residual's density takes in, s, and the largest density over that of white noise.
+COLOUR_S, LARGEST_COLOUR = 3.0, 400.0
+
+
+@dataclass(frozen=True)
+class VelocityFit:
+    """Constants by a receiver's velocity.
+
+    `layout` places the constants of `state.values` in θ; `covariance` (p, p); `information` (p, p) of the record alone
+    and `known` (p, p) of the prior, `pull` (p,) the record's gradient where the fit ended; `levels`; residuals of the
+    receiver `residual` (e, 3), m/s, at `t` (e,) s, with robust `weight` (e,); the magnetometer's mean robust weight;
+    `noise_turn`, `noise_push`: what sample-to-sample noise makes of the levels `turn` and `push`; iterations."""
+
+    state: State
+    layout: Mapping[str, slice]
+    covariance: Array
+    information: Array
+    known: Array
+    pull: Array
+    levels: Levels
+    t: Array
+    residual: Array
+    weight: Array
+    field_weight: float
+    noise_turn: float
+    noise_push: float
+    iterations: int
+    setting: Setting
+    path: Integrated
+
+    def constants(self, name: str) -> tuple[Array, Array, Array]:
+        """λ (3,), b (3,) of a triad in logged units and their covariance (6, 6)."""
+        value, columns = self.state.values[name], self.layout[name]
+        covariance = self.covariance[columns, columns]
+        if name != "magnetometer":
+            return value[:3], value[3:], covariance
+        gain, zero = value[:3], value[3:]
+        jacobian = np.block(
+            [[np.diag(-1.0 / gain**2), np.zeros((3, 3))], [np.diag(zero / gain**2), np.diag(-1.0 / gain)]]
+        )
+        return 1.0 / gain, -zero / gain, jacobian @ covariance @ jacobian.T
+
+    def found(self, name: str) -> tuple[Array, Array]:
+        """Value and covariance of another unknown."""
+        return self.state.values[name], self.covariance[self.layout[name], self.layout[name]]
+
+
+def fit_by_velocity(
+    readings: Readings,
+    epochs: Epochs,
+    start: Mapping[str, tuple[Array, Array]],
+    priors: Mapping[str, PriorConstants],
+    *,
+    field_known: bool,
+) -> VelocityFit:
+    """Scale and zero of all triads, the receiver's lag and its antenna's arm.
+
+    Between the receiver's epochs the readings are integrated (preintegration); at them the velocity of the antenna is
+    compared, never differentiated. Levels of noise are estimated with the constants, outliers lose weight by Huber's
+    rule, and what is correlated over seconds counts as often as its spectrum at low frequency says.
+
+    Parameters
+    ----------
+    readings : Readings
+        The record; it has an accelerometer.
+    epochs : Epochs
+        Velocities and claimed accuracies; accuracies that are not finite are taken for UNKNOWN_SD_MPS.
+    start : mapping
+        Triad → (scale, bias) within some tens of per cent; a magnetometer without one is left out.
+    priors : mapping
+        Triad → what is known beforehand; of the inertial triads both, since ordinary flight shows no accelerometer's
+        level scale.
+    field_known : bool
+        Whether dip and declination of `readings.field_ned` are those of the place.
+
+    Raises
+    ------
+    UnusableFlight
+        `velocity_too_short`: fewer than FEWEST_EPOCHS epochs with readings around them.
+    EstimationError
+        `velocity_diverged`: no minimum was found.
+
+    Notes
+    -----
+    It cannot see axes out of square, nor a receiver whose velocity is filtered over more than some tenths of a second.
+
+    References
+    ----------
+    Forster et al. (2017) for preintegration; Huber (1964).
+    """
+    epochs = replace(epochs, sd=np.maximum(np.where(np.isfinite(epochs.sd), epochs.sd, UNKNOWN_SD_MPS), LEAST_SD_MPS))
+    knots = place_knots(readings, epochs)
+    if int(np.sum(knots.epoch >= 0)) < FEWEST_EPOCHS:
+        raise UnusableFlight(
+            ReasonCode.VELOCITY_TOO_SHORT, "The receiver has too few velocities where the vehicle was moved."
+        )
+    return _Fit(readings, epochs, start, priors, field_known).run()
+
+
+DEBUG=False
+class _Fit:
+    """The iteration: `state` and `levels` change, the rest is the record."""
+
+    def __init__(
+        self,
+        readings: Readings,
+        epochs: Epochs,
+        start: Mapping[str, tuple[Array, Array]],
+        priors: Mapping[str, PriorConstants],
+        field_known: bool,
+    ) -> None:
+        self.readings = readings
+        self.knots = place_knots(readings, epochs)
+        gravity = np.array([0.0, 0.0, abs(readings.gravity_mps2)])
+        values = {name: np.concatenate(start[name]) for name in TRIADS if name in start}
+        with_field = "magnetometer" in start and readings.magnetometer is not None
+        if with_field:
+            scale, bias = start["magnetometer"]
+            values["magnetometer"] = np.r_[1.0 / scale, -bias / scale]
+            values["field"] = np.zeros(2)
+        else:
+            values.pop("magnetometer", None)
+        values |= {"lag": np.array([LAG_S]), "arm": np.zeros(3)}
+        self.layout = layout_of(values)
+        self.sign = float(np.sign(readings.gravity_mps2))
+        grid = grid_of(readings, self.knots, LAG_S)
+        path = self._integrated(grid, values)
+        lit = (path.count > 0) & self.knots.joined & with_field
+        self.setting = Setting(self.knots, epochs, gravity, np.asarray(readings.field_ned, dtype=float), lit)
+        q = attitudes(self.setting, path, values.get("magnetometer"))
+        self.state = State(q, velocities_at_knots(self.setting), values)
+        self.signs: list[Array] = []
+        self.known, self.expected = self._prior(priors, field_known)
+        self.noise_turn = max(_walk(readings, readings.gyroscope, start["gyroscope"][0]), LEAST_TURN)
+        assert readings.accelerometer is not None
+        self.noise_push = max(_walk(readings, readings.accelerometer, start["accelerometer"][0]), LEAST_PUSH)
+        field_variance = float(np.sum(self.setting.field**2)) * 0.05**2
+        if with_field:
+            field_variance *= float(np.mean(values["magnetometer"][:3] ** 2))
+        self.levels = Levels(
+            START_RATIO * self.noise_turn, START_RATIO * self.noise_push, np.ones(2), field_variance, np.ones(3)
+        )
+
+    def _integrated(self, grid: Grid, values: Mapping[str, Array]) -> Integrated:
+        return integrate(grid, values["gyroscope"], values["accelerometer"], self.sign)
+
+    def _prior(self, priors: Mapping[str, PriorConstants], field_known: bool) -> tuple[Array, Array]:
+        """Information (p, p) and expected values (p,) of the constants."""
+        p = max(columns.stop for columns in self.layout.values())
+        information, expected = np.zeros((p, p)), np.zeros(p)
+        for name, columns in self.layout.items():
+            if name in priors:
+                scale, bias, covariance = priors[name].scale, priors[name].bias, priors[name].covariance
+                if name == "magnetometer":
+                    jacobian = np.diag(np.r_[-1.0 / scale**2, -1.0 / scale])
+                    covariance = jacobian @ covariance @ jacobian.T
+                    scale, bias = 1.0 / scale, -bias / scale
+                expected[columns] = np.r_[scale, bias]
+                information[columns, columns] = np.linalg.inv(covariance)
+            elif name in TRIADS:
+                expected[columns] = self.state.values[name]
+        sd = FIELD_SD_RAD if field_known else UNKNOWN_FIELD_SD_RAD
+        for name, value, own_sd in (("field", 0.0, sd), ("lag", LAG_S, LAG_SD_S), ("arm", 0.0, ARM_SD_M)):
+            if name in self.layout:
+                at = np.arange(self.layout[name].start, self.layout[name].stop)
+                information[at, at], expected[at] = own_sd**-2, value
+        return information, expected
+
+    def run(self) -> VelocityFit:
+        rng = np.random.default_rng(0)
+        for iteration in range(1, MOST_ITERATIONS + 1):
+            grid = grid_of(self.readings, self.knots, self.state.lag_s)
+            path = self._integrated(grid, self.state.values)
+            rows = rows_of(self.setting, self.state, path, self.levels, self.layout)
+            if not self.signs:
+                self.signs = [rng.choice([-1.0, 1.0], size=one.residual.shape) for one in rows]
+                if len(rows) > 2:
+                    self.levels = replace(self.levels, field=float(robust_sigma(rows[2].residual)) ** 2)
+                    continue
+            weight = self._weights(rows)
+            theta = np.concatenate([self.state.values[name] for name in self.layout])
+            pulled = self.known @ (self.expected - theta)
+            try:
+                solved = solve(rows, weight, len(self.knots.offset), self.known, pulled, self.signs)
+            except np.linalg.LinAlgError as error:
+                raise _diverged() from error
+            sd = np.sqrt(np.diagonal(solved.covariance))
+            if not np.isfinite(solved.theta).all() or not np.isfinite(solved.knots).all():
+                raise _diverged()
+            self._move(solved, path)
+            if DEBUG: print(iteration, "step/sd %.3g"%np.max(np.abs(solved.theta)/sd), "turn %.3g push %.3g"%(self.levels.turn/self.noise_turn,self.levels.push/self.noise_push), self.levels.receiver, self.levels.field, self.levels.colour, "lag %.3f"%self.state.lag_s, "cost %.5g"%sum(float(np.sum(w*r.residual**2/r.variance)) for w,r in zip(weight,rows)), "knots %.3g"%np.abs(solved.knots[:,:3]).max())
+            before = self.levels
+            self.levels = self._renewed(rows, weight, solved)
+            changed = _level_change(before, self.levels)
+            if np.max(np.abs(solved.theta) / sd) < CONVERGED_SD and changed < CONVERGED_LEVEL:
+                return self._result(rows, weight, solved, path, iteration)
+        raise _diverged()
+
+    def _weights(self, rows: list[Rows]) -> list[Array]:
+        """Huber's weights of the receiver's epochs and the magnetometer's means, by the length of a row over its sd;
+        links are the model's own."""
+        out = [np.ones_like(rows[0].residual)]
+        for one in rows[1:]:
+            distance = np.linalg.norm(one.residual / np.sqrt(one.variance), axis=1)
+            own = huber_weights(distance, robust_sigma(distance))
+            out.append(np.repeat(own[:, None], one.residual.shape[1], axis=1))
+        return out
+
+    def _move(self, solved: Solved, path: Integrated) -> None:
+        """A step; a turn or lag too far for the linearisation is shortened, and with the lag the knots move."""
+        step = min(1.0, LARGEST_TURN_RAD / max(float(np.max(np.linalg.norm(solved.knots[:, :3], axis=1))), 1e-12))
+        theta = step * solved.theta
+        values = {name: self.state.values[name] + theta[columns] for name, columns in self.layout.items()}
+        late = float(np.clip(theta[self.layout["lag"]][0], -LARGEST_LAG_STEP_S, LARGEST_LAG_STEP_S))
+        lag = float(np.clip(self.state.lag_s + late, SMALLEST_LAG_S, LARGEST_LAG_S))
+        late = lag - self.state.lag_s
+        values["lag"] = np.array([lag])
+        q = multiply(from_rotation_vector(step * solved.knots[:, :3]), self.state.q)
+        frame_force = np.einsum("nij,nj->ni", path.turned.transpose(0, 2, 1), path.force)
+        from fieldcal.geometry.rotation import body_from_inertial
+
+        acceleration = np.einsum("nji,nj->ni", body_from_inertial(q), frame_force) + self.setting.gravity
+        velocity = self.state.velocity + step * solved.knots[:, 3:] - acceleration * late
+        q = multiply(q, from_rotation_vector(-path.rate * late))
+        self.state = State(q, velocity, values)
+
+    def _renewed(self, rows: list[Rows], weight: list[Array], solved: Solved) -> Levels:
+        """Variance components (REML) by the residuals after the step, to first order: their sums of squares against
+        the degrees of freedom left, by Newton's method in the logarithm."""
+        square, free, information = np.zeros((3, len(GROUPS)))
+        after = []
+        step = np.column_stack([solved.theta, solved.probes[0]])
+        knots = np.concatenate([solved.knots[..., None], solved.probes[1]], axis=2)
+        for one, robust, sign in zip(rows, weight, self.signs, strict=True):
+            root = np.sqrt(robust / one.variance)
+            changed = predicted(one, step, knots) * root[..., None]
+            whitened = one.residual * root + changed[..., 0]
+            after.append(whitened)
+            for column, group in enumerate(one.group):
+                kept = sign[:, column] - changed[:, column, 1 + group]
+                counted = robust[:, column]
+                square[group] += np.sum(whitened[:, column] ** 2)
+                free[group] += np.sum(sign[:, column] * kept) - np.sum(1.0 - counted)
+                information[group] += np.sum(kept**2)
+        old = self.levels
+        # Rows were weighted by coloured variances: white ones would be so many times as heavy.
+        of_group = np.ones(len(GROUPS))
+        of_group[[LEVEL, VERTICAL, FIELD]] = old.colour
+        ratio = np.ones(len(GROUPS))
+        given = information > 0.0
+        seen, free, information = (square * of_group)[given], np.maximum(free[given], 1e-6), information[given]
+        # Downwards the fixed point is the faster where Newton's step would be.
+        logarithm = np.minimum((seen - free) / information, np.where(seen < free, np.log(seen / free), np.inf))
+        ratio[given] = np.exp(np.clip(logarithm, -LARGEST_LOG_STEP, LARGEST_LOG_STEP))
+        return Levels(
+            max(old.turn * ratio[TURN], self.noise_turn),
+            max(old.push * ratio[PUSH], self.noise_push),
+            old.receiver * ratio[[LEVEL, VERTICAL]],
+            old.field * ratio[FIELD],
+            self._colour(rows, after),
+        )
+
+    def _colour(self, rows: list[Rows], after: list[Array]) -> Array:
+        out = np.ones(3)
+        for place, (which, columns) in enumerate(((1, [0, 1]), (1, [2]), (2, [0, 1, 2]))):
+            if which >= len(rows) or len(after[which]) < 10:
+                continue
+            x = after[which][:, columns]
+            interval_s = float(np.median(np.diff(self.knots.offset[rows[which].knot])))
+            out[place] = _density(x, int(np.clip(COLOUR_S / interval_s, 1, len(x) // 4)))
+        return out
+
+    def _result(
+        self, rows: list[Rows], weight: list[Array], solved: Solved, path: Integrated, iterations: int
+    ) -> VelocityFit:
+        receiver = rows[1]
+        covariance = solved.covariance * huber_inflation(weight[1][:, 0])
+        return VelocityFit(
+            self.state,
+            self.layout,
+            covariance,
+            solved.information,
+            self.known,
+            solved.pull,
+            self.levels,
+            self.knots.offset[receiver.knot],
+            -receiver.residual,
+            weight[1][:, 0],
+            float(weight[2].mean()) if len(weight) > 2 else 1.0,
+            self.noise_turn,
+            self.noise_push,
+            iterations,
+            self.setting,
+            path,
+        )
+
+
+def _walk(readings: Readings, logged: Array, scale: Array) -> float:
+    """Density of the random walk, (unit · s)²/s, that a triad's noise makes of its integral, mean of the axes: that of
+    its spectrum above the motion, by the longest stretch. 0 of a stretch that is too short."""
+    a, b = max(run_bounds(readings.segment), key=lambda bounds: bounds[1] - bounds[0])
+    known = a + np.flatnonzero(np.isfinite(logged[a:b]).all(axis=1))
+    if len(known) < 16:
+        return 0.0
+    index, interval_s = lattice(readings.t[known])
+    x = fill(index, logged[known] * scale)
+    frequency, density = power_density(x, interval_s, min(len(x), max(16, round(SPECTRUM_S / interval_s))))
+    low = min(NOISE_HZ[0], 0.5 * frequency[-1])
+    band = (frequency >= low) & (frequency <= max(NOISE_HZ[1], low))
+    return 0.5 * float(np.mean(np.median(density[band], axis=0)))
+
+
+def _density(x: Array, lags: int) -> float:
+    """Density at low frequency over that of white noise, from the tapered autocorrelation of x (m, c)."""
+    of_lag = np.array([np.sum(x[lag:] * x[: len(x) - lag]) for lag in range(lags + 1)])
+    taper = 1.0 - np.arange(1, lags + 1) / (lags + 1)
+    return float(np.clip(1.0 + 2.0 * (taper @ of_lag[1:]) / max(of_lag[0], 1e-300), 1.0, LARGEST_COLOUR))
+
+
+def _level_change(before: Levels, after: Levels) -> float:
+    old, new = (np.r_[v.turn, v.push, v.receiver * v.colour[:2], v.field * v.colour[2]] for v in (before, after))
+    return float(np.max(np.abs(new / old - 1.0)))
+
+
+def _diverged() -> EstimationError:
+    return EstimationError(
+        ReasonCode.VELOCITY_DIVERGED, "The estimate by the receiver's velocity did not converge: the two contradict."
+    )
