@@ -136,6 +136,8 @@ def _receiver(
     here[:, :, 3:], here[:, :, :3] = np.eye(3), -skew(swung)
     theta[:, :, layout["arm"]] = attitude[knot] @ skew(rate)
     acceleration = np.einsum("nij,nj->ni", frame[knot], path.force[knot]) + setting.gravity
+    swing = np.cross(path.rate_change[knot], arm) + np.cross(rate, np.cross(rate, arm))
+    acceleration += np.einsum("nij,nj->ni", attitude[knot], swing)
     theta[:, :, layout["lag"]] = -acceleration[:, :, None]
     by_rate = -attitude[knot] @ skew(arm)
     gyroscope = layout["gyroscope"]
@@ -173,6 +175,20 @@ def _field(
     residual = gain * sensed + zero - path.reading[knot]
     variance = np.full(residual.shape, levels.field * levels.colour[2])
     return Rows(residual, here, None, theta, knot, variance, (FIELD,) * 3)
+
+
+def noise_in_readings(links: Rows, state: State, layout: Mapping[str, slice]) -> Array:
+    """What is added to the gradient (p,) because readings, by which the sensitivity to a scale is made, have the noise
+    that makes the attitude and velocity jump: without it a noisy gyroscope's scale comes out too small (as in
+    `joint.score_corrections`)."""
+    out = np.zeros(links.theta.shape[2])
+    back = body_from_inertial(state.q[links.knot])
+    for name, rows in (("gyroscope", slice(0, 3)), ("accelerometer", slice(3, 6))):
+        jump = np.einsum("nij,nj->ni", back, links.residual[:, rows])
+        share = np.sum(jump**2 / links.variance[:, rows], axis=0)
+        first = layout[name].start
+        out[first : first + 3] = share / state.values[name][:3]
+    return out
 
 
 @dataclass(frozen=True)

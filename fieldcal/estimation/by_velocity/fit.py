@@ -11,7 +11,7 @@ import numpy as np
 
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation.by_velocity.equations import FIELD, GROUPS, LEVEL, PUSH, TURN, VERTICAL, Rows, Setting, Solved
-from fieldcal.estimation.by_velocity.equations import predicted, rows_of, solve
+from fieldcal.estimation.by_velocity.equations import noise_in_readings, predicted, rows_of, solve
 from fieldcal.estimation.by_velocity.problem import (
     LARGEST_LAG_S,
     SMALLEST_LAG_S,
@@ -28,7 +28,7 @@ from fieldcal.estimation.by_velocity.strapdown import Grid, Integrated, grid_of,
 from fieldcal.estimation.joint.problem import PriorConstants, Readings
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.smoothing import fill, lattice
-from fieldcal.estimation.statistics import huber_inflation, huber_weights, power_density, robust_sigma
+from fieldcal.estimation.statistics import huber_inflation, power_density, robust_sigma
 from fieldcal.geometry.rotation import Array, from_rotation_vector, multiply
 from fieldcal.reason_codes import ReasonCode
 
@@ -40,8 +40,12 @@ FIELD_SD_RAD, UNKNOWN_FIELD_SD_RAD = 0.03, 0.5
 UNKNOWN_SD_MPS = 0.3  # of a velocity of which the receiver does not say
 LEAST_SD_MPS = 0.02
 FEWEST_EPOCHS = 50
+# Length of a row over its sd beyond which it loses influence, as in the joint estimate; the median of χ with three.
+CLIP_SD, MEDIAN_LENGTH = 4.0, 1.538
 MOST_ITERATIONS = 40
-# Converged: no constant moves by more than this share of its sd, no level by more than that share.
+UNDAMPED_ITERATIONS, DAMPING = 8, 0.5  # of the levels, which may swing about where they belong
+# Converged: no constant moves by more than this share of its sd, no level by more
+# than that share, or that many of its sd where it is less well known.
 CONVERGED_SD, CONVERGED_LEVEL = 0.03, 0.03
 # A walk's density over that which the triad's noise makes: at the start, where attitudes are wrong by more than noise;
 # it is 1 at least. Logarithm of the factor by which a level may change in an iteration.
@@ -182,6 +186,7 @@ class _Fit:
         q = attitudes(self.setting, path, values.get("magnetometer"))
         self.state = State(q, velocities_at_knots(self.setting), values)
         self.signs: list[Array] = []
+        self.damping, self.change = 1.0, np.inf
         self.known, self.expected = self._prior(priors, field_known)
         self.noise_turn = max(_walk(readings, readings.gyroscope, start["gyroscope"][0]), LEAST_TURN)
         assert readings.accelerometer is not None
@@ -231,7 +236,8 @@ class _Fit:
                     continue
             weight = self._weights(rows)
             theta = np.concatenate([self.state.values[name] for name in self.layout])
-            pulled = self.known @ (self.expected - theta)
+            corrected = noise_in_readings(rows[0], self.state, self.layout)
+            pulled = self.known @ (self.expected - theta) + corrected
             try:
                 solved = solve(rows, weight, len(self.knots.offset), self.known, pulled, self.signs)
             except np.linalg.LinAlgError as error:
@@ -241,20 +247,20 @@ class _Fit:
                 raise _diverged()
             self._move(solved, path)
             if DEBUG: print(iteration, "step/sd %.3g"%np.max(np.abs(solved.theta)/sd), "turn %.3g push %.3g"%(self.levels.turn/self.noise_turn,self.levels.push/self.noise_push), self.levels.receiver, self.levels.field, self.levels.colour, "lag %.3f"%self.state.lag_s, "cost %.5g"%sum(float(np.sum(w*r.residual**2/r.variance)) for w,r in zip(weight,rows)), "knots %.3g"%np.abs(solved.knots[:,:3]).max())
-            before = self.levels
+            self.damping = 1.0 if iteration <= UNDAMPED_ITERATIONS else DAMPING
             self.levels = self._renewed(rows, weight, solved)
-            changed = _level_change(before, self.levels)
-            if np.max(np.abs(solved.theta) / sd) < CONVERGED_SD and changed < CONVERGED_LEVEL:
+            if np.max(np.abs(solved.theta) / sd) < CONVERGED_SD and self.change < CONVERGED_LEVEL:
                 return self._result(rows, weight, solved, path, iteration)
         raise _diverged()
 
     def _weights(self, rows: list[Rows]) -> list[Array]:
-        """Huber's weights of the receiver's epochs and the magnetometer's means, by the length of a row over its sd;
-        links are the model's own."""
+        """Redescending weights of the receiver's epochs and the magnetometer's means, by a row's length over the median
+        one: 1 up to CLIP_SD, (CLIP_SD/d)⁴ beyond. Links are the model's own."""
         out = [np.ones_like(rows[0].residual)]
         for one in rows[1:]:
             distance = np.linalg.norm(one.residual / np.sqrt(one.variance), axis=1)
-            own = huber_weights(distance, robust_sigma(distance))
+            distance /= max(float(np.median(distance)), 1e-12) / MEDIAN_LENGTH
+            own = np.minimum(1.0, CLIP_SD / np.maximum(distance, 1e-12)) ** 4
             out.append(np.repeat(own[:, None], one.residual.shape[1], axis=1))
         return out
 
@@ -303,10 +309,14 @@ class _Fit:
         seen, free, information = (square * of_group)[given], np.maximum(free[given], 1e-6), information[given]
         # Downwards the fixed point is the faster where Newton's step would be.
         logarithm = np.minimum((seen - free) / information, np.where(seen < free, np.log(seen / free), np.inf))
-        ratio[given] = np.exp(np.clip(logarithm, -LARGEST_LOG_STEP, LARGEST_LOG_STEP))
+        ratio[given] = np.exp(self.damping * np.clip(logarithm, -LARGEST_LOG_STEP, LARGEST_LOG_STEP))
+        # Walks are no less than what the triads' noise makes.
+        ratio[TURN] = max(ratio[TURN], self.noise_turn / old.turn)
+        ratio[PUSH] = max(ratio[PUSH], self.noise_push / old.push)
+        self.change = float(np.max(np.abs(ratio[given] - 1.0) * np.minimum(1.0, np.sqrt(0.5 * information))))
         return Levels(
-            max(old.turn * ratio[TURN], self.noise_turn),
-            max(old.push * ratio[PUSH], self.noise_push),
+            old.turn * ratio[TURN],
+            old.push * ratio[PUSH],
             old.receiver * ratio[[LEVEL, VERTICAL]],
             old.field * ratio[FIELD],
             self._colour(rows, after),
@@ -367,11 +377,6 @@ def _density(x: Array, lags: int) -> float:
     of_lag = np.array([np.sum(x[lag:] * x[: len(x) - lag]) for lag in range(lags + 1)])
     taper = 1.0 - np.arange(1, lags + 1) / (lags + 1)
     return float(np.clip(1.0 + 2.0 * (taper @ of_lag[1:]) / max(of_lag[0], 1e-300), 1.0, LARGEST_COLOUR))
-
-
-def _level_change(before: Levels, after: Levels) -> float:
-    old, new = (np.r_[v.turn, v.push, v.receiver * v.colour[:2], v.field * v.colour[2]] for v in (before, after))
-    return float(np.max(np.abs(new / old - 1.0)))
 
 
 def _diverged() -> EstimationError:

@@ -72,7 +72,8 @@ def grid_of(readings: Readings, knots: Knots, lag_s: float) -> Grid:
 class Integrated:
     """A record integrated with some constants, axes of its beginning ("frame 0"); parameters (λ, b) of a triad.
 
-    At knots: `turned` (K, 3, 3) sensor axes there to frame 0; `rate` (K, 3) rad/s, sensor axes; `force` (K, 3) m/s².
+    At knots: `turned` (K, 3, 3) sensor axes there to frame 0; `rate` (K, 3) rad/s, sensor axes, and its derivative
+    `rate_change` (K, 3) rad/s²; `force` (K, 3) m/s².
     Over intervals: `push` (K−1, 3) m/s, integral of specific force; `turn_by_gyroscope` (K−1, 3, 6) ∂(rotation vector
     of the end's attitude), `push_by_gyroscope`, `push_by_accelerometer` (K−1, 3, 6) ∂push.
     Of the magnetometer over intervals: `count` (K−1,) readings, `reading` (K−1, 3) their mean, `axes` (K−1, 3, 3) mean
@@ -81,6 +82,7 @@ class Integrated:
 
     turned: Array
     rate: Array
+    rate_change: Array
     rate_logged: Array
     force: Array
     push: Array
@@ -129,6 +131,7 @@ def integrate(grid: Grid, gyroscope: Array, accelerometer: Array, gravity_sign: 
     return Integrated(
         turned=turned[knot],
         rate=_slope(grid.t, angle, at),
+        rate_change=(_slope(grid.t, angle, at + NEAR_S) - _slope(grid.t, angle, at - NEAR_S)) / (2.0 * NEAR_S),
         rate_logged=_slope(grid.t, total(grid.gyroscope), at),
         force=_slope(grid.t, moved, at),
         push=push,
@@ -144,6 +147,7 @@ def integrate(grid: Grid, gyroscope: Array, accelerometer: Array, gravity_sign: 
 
 def _slope(t: Array, x: Array, at: Array) -> Array:
     """Mean slope of x (N, 3) over NEAR_S on either side of `at` (K,), within the samples."""
-    low, high = np.maximum(at - NEAR_S, t[0]), np.minimum(at + NEAR_S, t[-1])
+    middle = np.clip(at, t[0] + 0.1 * NEAR_S, t[-1] - 0.1 * NEAR_S)
+    low, high = np.maximum(middle - NEAR_S, t[0]), np.minimum(middle + NEAR_S, t[-1])
     change = np.column_stack([np.interp(high, t, c) - np.interp(low, t, c) for c in x.T])
     return np.asarray(change / (high - low)[:, None])
