@@ -63,6 +63,8 @@ class Rung(StrEnum):
 
     BY_VPS = "by_vps"
     """Gyroscope by the VPS's attitude, vector triads by the trajectory."""
+    BY_VELOCITY = "by_velocity"
+    """All triads by a satellite receiver's velocity."""
     FREE = "free"
     """Everything by vectors."""
     HELD = "held"
@@ -77,6 +79,8 @@ class Method(StrEnum):
     """The estimator that a row of the history comes from."""
 
     JOINT = "joint"
+    VELOCITY = "velocity"
+    """The joint one by a satellite receiver's velocity."""
     OUTPUT_ERROR = "output_error"
     EQUATION_ERROR = "equation_error"
     ELLIPSOID_ROBUST = "ellipsoid_robust"
@@ -90,8 +94,11 @@ class Method(StrEnum):
     """Of flights together, by `fieldcal refit`."""
 
 
+JOINT_METHODS = (Method.JOINT, Method.VELOCITY)
+"""What stage `joint` gives, one of them a flight."""
 PREFERRED_METHODS = (
     Method.JOINT,
+    Method.VELOCITY,
     Method.OUTPUT_ERROR,
     Method.ELLIPSOID_ROBUST,
     Method.ELLIPSOID,

@@ -100,6 +100,9 @@ class Parameters(Table):
         "auto",
         'VPS in the estimate (method joint): "auto" and true use one that can be used, true tells where there is none',
     )
+    use_velocity: bool = parameter(
+        True, "velocity of a satellite receiver in the estimate (method joint), where there is no VPS"
+    )
     vps_max_lag_s: float = parameter(
         60.0,
         "clock offset searched first; beyond it only a match without doubt counts, and is told",

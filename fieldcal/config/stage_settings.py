@@ -281,6 +281,7 @@ class JointSettings(BodyVectors, ReferenceReading, LocalField, FieldOrigin, Grav
     """Stage `joint`."""
 
     method: Mapping[Sensor, Approach]
+    use_velocity: bool
     lever_arm_m: Triple | None
     ellipsoid_max_scale_sd: float
     ellipsoid_max_residual: float

@@ -11,7 +11,7 @@ from fieldcal.estimation.smoothing import low_pass
 from fieldcal.estimation.statistics import least_squares_covariance
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
-from fieldcal.names import SENSORS, Approach, Json, Method, Sensor, Status
+from fieldcal.names import JOINT_METHODS, SENSORS, Approach, Json, Method, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.beside.motor_field import allow_for_motor_field
 from fieldcal.stages.inputs import Tables
@@ -59,14 +59,14 @@ def choose(tables: Tables, s: ChoiceSettings) -> StageResult:
             continue
         own = rows.filter(sensor=sensor, parameter="scale")
         methods = own["method"].unique().to_list()
-        if Method.JOINT not in methods:
+        if not set(JOINT_METHODS) & set(methods):
             chosen[sensor] = Approach.SERIAL
             fault = None if contradictions is None else fatal_fault(contradictions, (sensor,))
             if fault is not None:
                 rows = _refused(rows, sensor, methods, None, ReasonCode(fault["reason_code"]))
                 chosen[sensor] = None
             continue
-        serial = [name for name in methods if name != Method.JOINT]
+        serial = [name for name in methods if name not in JOINT_METHODS]
         if sensor == Sensor.GYROSCOPE and _joint_drifts(rows, tables):
             rows = _refused(rows, sensor, [Method.JOINT], None, ReasonCode.OTHER_METHOD_CHOSEN)
             chosen[sensor] = Approach.SERIAL
@@ -106,7 +106,7 @@ def _with_motor_field(rows: pl.DataFrame, faults: pl.DataFrame | None, strength:
     found = None if faults is None else faults.filter(reason_code=str(ReasonCode.MOTOR_FIELD))
     if found is None or found.is_empty():
         return rows
-    own = (pl.col("sensor") == Sensor.MAGNETOMETER) & (pl.col("method") == Method.JOINT)
+    own = (pl.col("sensor") == Sensor.MAGNETOMETER) & pl.col("method").is_in(JOINT_METHODS)
     widened = allow_for_motor_field(rows.filter(own), float(found["number"][0]), strength)
     return pl.concat([rows.filter(~own), widened])
 

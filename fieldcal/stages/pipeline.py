@@ -248,6 +248,7 @@ PIPELINE: tuple[Stage, ...] = (
             **TRIAD,
             "imu": "ingest.imu",
             "vps": "ingest.vps",
+            "gnss_velocity": "ingest.gnss_velocity",
             "magnetometer_log": "ingest.magnetometer",
             "magnetometer": "magnetometer.calibration",
             "accelerometer": "accelerometer_pass2.calibration",

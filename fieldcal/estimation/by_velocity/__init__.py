@@ -1,1 +1,1 @@
-"""All triads by a satellite receiver's velocity: between its epochs the readings are integrated, attitude and velocity."""
+"""All triads by a satellite receiver's velocity: between its epochs the readings are integrated."""

@@ -193,9 +193,11 @@ def noise_in_readings(links: Rows, state: State, layout: Mapping[str, slice]) ->
 
 @dataclass(frozen=True)
 class Solved:
-    """A step of Gauss and Newton: `theta` (p,), `knots` (K, 6); `information` (p, p) of the constants, knots eliminated,
-    without the prior; `covariance` (p, p) with it; `pull` (p,) the gradient; `probes` the same step for the probe of each group of rows: what of it
-    the unknowns take, `theta` (p, 5), `knots` (K, 6, 5)."""
+    """A step of Gauss and Newton: `theta` (p,), `knots` (K, 6).
+
+    `information` (p, p) of the constants, knots eliminated, without the prior, and its gradient `pull` (p,);
+    `covariance` (p, p) with the prior; `probes`: the same step for the probe of each group of rows, what of it the
+    unknowns take, `theta` (p, 5), `knots` (K, 6, 5)."""
 
     theta: Array
     knots: Array
@@ -205,16 +207,19 @@ class Solved:
     probes: tuple[Array, Array]
 
 
-def solve(rows: list[Rows], weight: list[Array], knots: int, prior: Array, pulled: Array, rng_signs: list[Array]) -> Solved:
+def solve(
+    rows: list[Rows], weight: list[Array], knots: int, known: tuple[Array, Array], score: Array, signs: list[Array]
+) -> Solved:
     """Normal equations of all rows, weighted (m, r) by robustness beside their variance, and their solution.
 
-    `prior` (p, p) information and `pulled` (p,) its pull at the state; `rng_signs`: ±1 for each residual, the probe of
-    the trace of the hat matrix."""
+    `known`: information (p, p) of the prior and its pull (p,) at the state; `score` (p,): what the rows' gradient lacks
+    (`noise_in_readings`); `signs`: ±1 for each residual, the probe of the trace of the hat matrix."""
+    prior, pulled = known
     p = len(prior)
     rights = 1 + len(GROUPS)
     diagonal, below = np.zeros((knots, STATES, STATES)), np.zeros((knots - 1, STATES, STATES))
     right, own, own_right = np.zeros((knots, STATES, p + rights)), np.zeros((p, p)), np.zeros((p, rights))
-    for one, robust, sign in zip(rows, weight, rng_signs, strict=True):
+    for one, robust, sign in zip(rows, weight, signs, strict=True):
         w = robust / one.variance
         drawn = np.zeros((*w.shape, rights))
         drawn[..., 0] = -w * one.residual
@@ -244,7 +249,7 @@ def solve(rows: list[Rows], weight: list[Array], knots: int, prior: Array, pulle
     total = information + prior
     scale = 1.0 / np.sqrt(np.diagonal(total))
     inverse = np.linalg.inv(total * np.outer(scale, scale)) * np.outer(scale, scale)
-    gradient[:, 0] += pulled
+    gradient[:, 0] += pulled + score
     theta = inverse @ gradient
     whole = carried[:, :, p:] - carried[:, :, :p] @ theta
     probes = theta[:, 1:], whole[..., 1:]

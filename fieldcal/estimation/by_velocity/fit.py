@@ -1,6 +1,4 @@
-"""All triads, attitude and velocity by a receiver's velocity: Gauss–Newton with noise levels estimated beside.
-
-Raises `no_velocity` … see `fit_by_velocity`."""
+"""All triads, attitude and velocity by a receiver's velocity: Gauss–Newton with noise levels estimated beside."""
 
 from __future__ import annotations
 
@@ -10,26 +8,47 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fieldcal.errors import EstimationError, UnusableFlight
-from fieldcal.estimation.by_velocity.equations import FIELD, GROUPS, LEVEL, PUSH, TURN, VERTICAL, Rows, Setting, Solved
-from fieldcal.estimation.by_velocity.equations import noise_in_readings, predicted, rows_of, solve
+from fieldcal.estimation.by_velocity.equations import (
+    FIELD,
+    GROUPS,
+    LEVEL,
+    PUSH,
+    TURN,
+    VERTICAL,
+    Rows,
+    Setting,
+    Solved,
+    noise_in_readings,
+    predicted,
+    rows_of,
+    solve,
+)
 from fieldcal.estimation.by_velocity.problem import (
     LARGEST_LAG_S,
     SMALLEST_LAG_S,
     TRIADS,
     Epochs,
     Levels,
-    Prior,
     State,
     layout_of,
     place_knots,
 )
 from fieldcal.estimation.by_velocity.start import attitudes, velocities_at_knots
 from fieldcal.estimation.by_velocity.strapdown import Grid, Integrated, grid_of, integrate
+from fieldcal.estimation.gyroscope.output_error import propagate_stretches
 from fieldcal.estimation.joint.problem import PriorConstants, Readings
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.smoothing import fill, lattice
 from fieldcal.estimation.statistics import huber_inflation, power_density, robust_sigma
-from fieldcal.geometry.rotation import Array, from_rotation_vector, multiply
+from fieldcal.geometry.rotation import (
+    Array,
+    body_from_inertial,
+    conjugate,
+    continuous,
+    from_rotation_vector,
+    multiply,
+    slerp,
+)
 from fieldcal.reason_codes import ReasonCode
 
 # What is known of a receiver beforehand.
@@ -43,6 +62,7 @@ FEWEST_EPOCHS = 50
 # Length of a row over its sd beyond which it loses influence, as in the joint estimate; the median of χ with three.
 CLIP_SD, MEDIAN_LENGTH = 4.0, 1.538
 MOST_ITERATIONS = 40
+ROUGH_ITERATIONS = 4  # while jumps are the start's errors, not noise
 UNDAMPED_ITERATIONS, DAMPING = 8, 0.5  # of the levels, which may swing about where they belong
 # Converged: no constant moves by more than this share of its sd, no level by more
 # than that share, or that many of its sd where it is less well known.
@@ -63,7 +83,8 @@ class VelocityFit:
     """Constants by a receiver's velocity.
 
     `layout` places the constants of `state.values` in θ; `covariance` (p, p); `information` (p, p) of the record alone
-    and `known` (p, p) of the prior, `pull` (p,) the record's gradient where the fit ended; `levels`; residuals of the
+    and `pull` (p,) its gradient where the fit ended, both to be divided by `inflation`, which is in the covariance for
+    what clipped residuals do not say; `levels`; residuals of the
     receiver `residual` (e, 3), m/s, at `t` (e,) s, with robust `weight` (e,); the magnetometer's mean robust weight;
     `noise_turn`, `noise_push`: what sample-to-sample noise makes of the levels `turn` and `push`; iterations."""
 
@@ -71,8 +92,8 @@ class VelocityFit:
     layout: Mapping[str, slice]
     covariance: Array
     information: Array
-    known: Array
     pull: Array
+    inflation: float
     levels: Levels
     t: Array
     residual: Array
@@ -95,6 +116,25 @@ class VelocityFit:
             [[np.diag(-1.0 / gain**2), np.zeros((3, 3))], [np.diag(zero / gain**2), np.diag(-1.0 / gain)]]
         )
         return 1.0 / gain, -zero / gain, jacobian @ covariance @ jacobian.T
+
+    def attitude(self, readings: Readings) -> Array:
+        """At every sample (n, 4), sensor axes, NED: the gyroscope's integral turned onto the knots."""
+        rate = readings.gyroscope * self.state.values["gyroscope"][:3] + self.state.values["gyroscope"][3:]
+        relative = propagate_stretches(readings.t, rate, readings.segment)
+        at = self.setting.knots.offset - self.state.lag_s
+        own = slerp(readings.t, relative, at)
+        offset = multiply(self.state.q, conjugate(own))
+        out = np.empty_like(relative)
+        for number in np.unique(readings.segment):
+            here = readings.segment == number
+            first, last = readings.t[here][[0, -1]]
+            inside = (at >= first) & (at <= last)
+            # A stretch without an epoch takes the offset of its neighbour: its heading is anyone's guess.
+            which = np.flatnonzero(inside) if inside.any() else np.array([int(np.argmin(np.abs(at - first)))])
+            times, values = at[which], continuous(offset[which])
+            carried = slerp(times, values, np.clip(readings.t[here], *times[[0, -1]])) if len(times) > 1 else values
+            out[here] = multiply(carried, relative[here])
+        return out
 
     def found(self, name: str) -> tuple[Array, Array]:
         """Value and covariance of another unknown."""
@@ -153,7 +193,6 @@ def fit_by_velocity(
     return _Fit(readings, epochs, start, priors, field_known).run()
 
 
-DEBUG=False
 class _Fit:
     """The iteration: `state` and `levels` change, the rest is the record."""
 
@@ -236,17 +275,18 @@ class _Fit:
                     continue
             weight = self._weights(rows)
             theta = np.concatenate([self.state.values[name] for name in self.layout])
-            corrected = noise_in_readings(rows[0], self.state, self.layout)
-            pulled = self.known @ (self.expected - theta) + corrected
+            score: Array
+            pulled, score = self.known @ (self.expected - theta), np.zeros(len(theta))
+            if iteration > ROUGH_ITERATIONS:
+                score = noise_in_readings(rows[0], self.state, self.layout)
             try:
-                solved = solve(rows, weight, len(self.knots.offset), self.known, pulled, self.signs)
+                solved = solve(rows, weight, len(self.knots.offset), (self.known, pulled), score, self.signs)
             except np.linalg.LinAlgError as error:
                 raise _diverged() from error
             sd = np.sqrt(np.diagonal(solved.covariance))
             if not np.isfinite(solved.theta).all() or not np.isfinite(solved.knots).all():
                 raise _diverged()
             self._move(solved, path)
-            if DEBUG: print(iteration, "step/sd %.3g"%np.max(np.abs(solved.theta)/sd), "turn %.3g push %.3g"%(self.levels.turn/self.noise_turn,self.levels.push/self.noise_push), self.levels.receiver, self.levels.field, self.levels.colour, "lag %.3f"%self.state.lag_s, "cost %.5g"%sum(float(np.sum(w*r.residual**2/r.variance)) for w,r in zip(weight,rows)), "knots %.3g"%np.abs(solved.knots[:,:3]).max())
             self.damping = 1.0 if iteration <= UNDAMPED_ITERATIONS else DAMPING
             self.levels = self._renewed(rows, weight, solved)
             if np.max(np.abs(solved.theta) / sd) < CONVERGED_SD and self.change < CONVERGED_LEVEL:
@@ -275,8 +315,6 @@ class _Fit:
         values["lag"] = np.array([lag])
         q = multiply(from_rotation_vector(step * solved.knots[:, :3]), self.state.q)
         frame_force = np.einsum("nij,nj->ni", path.turned.transpose(0, 2, 1), path.force)
-        from fieldcal.geometry.rotation import body_from_inertial
-
         acceleration = np.einsum("nji,nj->ni", body_from_inertial(q), frame_force) + self.setting.gravity
         velocity = self.state.velocity + step * solved.knots[:, 3:] - acceleration * late
         q = multiply(q, from_rotation_vector(-path.rate * late))
@@ -286,7 +324,7 @@ class _Fit:
         """Variance components (REML) by the residuals after the step, to first order: their sums of squares against
         the degrees of freedom left, by Newton's method in the logarithm."""
         square, free, information = np.zeros((3, len(GROUPS)))
-        after = []
+        after: list[Array] = []
         step = np.column_stack([solved.theta, solved.probes[0]])
         knots = np.concatenate([solved.knots[..., None], solved.probes[1]], axis=2)
         for one, robust, sign in zip(rows, weight, self.signs, strict=True):
@@ -336,14 +374,14 @@ class _Fit:
         self, rows: list[Rows], weight: list[Array], solved: Solved, path: Integrated, iterations: int
     ) -> VelocityFit:
         receiver = rows[1]
-        covariance = solved.covariance * huber_inflation(weight[1][:, 0])
+        inflation = huber_inflation(weight[1][:, 0])
         return VelocityFit(
             self.state,
             self.layout,
-            covariance,
+            solved.covariance * inflation,
             solved.information,
-            self.known,
             solved.pull,
+            inflation,
             self.levels,
             self.knots.offset[receiver.knot],
             -receiver.residual,

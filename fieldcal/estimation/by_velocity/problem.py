@@ -106,8 +106,8 @@ def layout_of(names: Mapping[str, Array]) -> dict[str, slice]:
 @dataclass(frozen=True)
 class Levels:
     """Noise: `turn` rad²/s and `push` (m/s)²/s, densities of the random walks that gyroscope and accelerometer make of
-    attitude and velocity; `receiver` (2,) level and vertical variance over what the receiver claims; `field` variance of
-    a magnetometer's mean over an interval; `colour` (3,) density at low frequency over that of white noise, of level
+    attitude and velocity; `receiver` (2,) level and vertical variance over what the receiver claims; `field` variance
+    of a magnetometer's mean over an interval; `colour` (3,) density at low frequency over that of white noise, of level
     and vertical velocity and of the magnetometer."""
 
     turn: float

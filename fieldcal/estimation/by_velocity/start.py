@@ -1,4 +1,4 @@
-"""Attitudes to start from: what turns the integrated readings of some seconds onto what the receiver and the field say."""
+"""Attitudes to start from: what turns some seconds of integrated readings onto what receiver and field say."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Readings integrated between knots, and how that depends on the constants: preintegration.
 
-Everything is integrated once over the record, in the axes that the sensor had at its beginning; what an interval adds is
-the difference of two cumulative sums, turned to the knot's attitude."""
+Everything is integrated once over the record, in the axes that the sensor had at its beginning; what an interval adds
+is the difference of two cumulative sums, turned to the knot's attitude."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ def grid_of(readings: Readings, knots: Knots, lag_s: float) -> Grid:
     place[order] = np.arange(len(t))
     assert readings.accelerometer is not None
     both = []
-    for logged in (readings.gyroscope, readings.accelerometer):
-        known = np.isfinite(logged).all(axis=1)
-        columns = [np.interp(t[order], readings.t[known], column) for column in logged[known].T]
+    for x in (readings.gyroscope, readings.accelerometer):
+        known = np.isfinite(x).all(axis=1)
+        columns = [np.interp(t[order], readings.t[known], column) for column in x[known].T]
         both.append(np.column_stack(columns))
     logged = readings.magnetometer
+    field: Array = np.zeros((0, 3))
     if logged is None:
         seen = np.zeros(0, dtype=np.int64)
-        field = np.zeros((0, 3))
     else:
         valid = np.flatnonzero(np.isfinite(logged[samples]).all(axis=1))
         seen, field = place[valid], logged[samples[valid]]

@@ -1,10 +1,10 @@
-"""The joint estimate of all triads and the attitude (method `joint`): by the VPS where there is one, else by vectors;
-judged, tried on held-out data, written."""
+"""The joint estimate of all triads and the attitude: by the VPS where there is one, else by a satellite receiver's
+velocity (method `velocity`) or by vectors; judged, tried on held-out data, written."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,33 +12,33 @@ import polars as pl
 
 from fieldcal.errors import EstimationError, FieldcalError, UnusableFlight
 from fieldcal.estimation.by_pose.triad import TriadByPose
+from fieldcal.estimation.by_velocity.problem import Epochs
 from fieldcal.estimation.faults import Fault
 from fieldcal.estimation.joint import model_selection
 from fieldcal.estimation.joint.fit import JointFit
 from fieldcal.estimation.joint.ladder import fit_with_fallbacks
-from fieldcal.estimation.joint.problem import PriorConstants, Readings
-from fieldcal.geometry import sensor_model
-from fieldcal.geometry.rotation import Array, from_matrix, multiply
-from fieldcal.names import SENSORS, Approach, Json, Method, Rung, Sensor, Status
+from fieldcal.estimation.joint.problem import Readings
+from fieldcal.geometry.rotation import Array, multiply
+from fieldcal.names import SENSORS, Json, Method, Rung, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables, mean_temperature, reference_reading, refusal
 from fieldcal.stages.joint.beside import beside_rows
+from fieldcal.stages.joint.by_velocity import better, epochs_of, estimate_by_velocity, not_taken, noted, travelled
 from fieldcal.stages.joint.by_vps import (
     ByVps,
     estimate_by_vps,
     not_used,
     poses_of,
 )
+from fieldcal.stages.joint.found import UNITS, Found, axes_of, chosen, found_of, priors, trajectory_table
 from fieldcal.stages.joint.information import information_of
-from fieldcal.stages.joint.judgement import judged, judged_scales, judged_zeros, measured_of, triad_of
+from fieldcal.stages.joint.judgement import judged, judged_scales, measured_of, triad_of
 from fieldcal.stages.joint.readings import readings_of, start_constants
 from fieldcal.stages.results import StageResult, fatal_fault, fault_rows, triad_rows, zero_slope_rows
 from fieldcal.stages.tables import (
     AXES,
-    QUATERNION,
     CalibrationRow,
     calibration_rows,
-    columns_of,
     covariance_table,
     matrix,
     triad,
@@ -48,21 +48,7 @@ from fieldcal.stages.vps_poses import AdmittedPoses
 if TYPE_CHECKING:
     from fieldcal.config.stage_settings import JointSettings
 
-UNITS = {Sensor.MAGNETOMETER: "", Sensor.ACCELEROMETER: "m/s^2", Sensor.GYROSCOPE: "rad/s"}
 HELD_IN_SHARE = 0.7
-
-
-@dataclass(frozen=True)
-class Found:
-    """A triad's constants in logged units, matrix (3, 3) and bias (3,), with the covariance (6, 6) of its diagonal and
-    bias, the sd (3, 3) of a full matrix, and why an axis' scale or zero is refused."""
-
-    matrix: Array
-    bias: Array
-    covariance: Array
-    cross_sd: Array | None
-    codes: list[ReasonCode | None]
-    zero_codes: list[ReasonCode | None]
 
 
 def estimate_jointly(tables: Tables, s: JointSettings) -> StageResult:
@@ -88,7 +74,28 @@ def estimate_jointly(tables: Tables, s: JointSettings) -> StageResult:
             return _with_vps(estimate_by_vps(readings, poses, s), readings, tables, s, poses)
         except (UnusableFlight, EstimationError) as error:
             by_vps = not_used(error)
-    return _with_vectors(readings, tables, s, by_vps)
+    epochs = epochs_of(tables, s) if poses is None else None
+    if epochs is None:
+        return _with_vectors(readings, tables, s, by_vps)
+    return _with_velocity(epochs, readings, tables, s, by_vps)
+
+
+def _with_velocity(
+    epochs: Epochs, readings: Readings, tables: Tables, s: JointSettings, by_vps: Mapping[str, Json]
+) -> StageResult:
+    """By the receiver's velocity where the vehicle travelled, which the vectors' model has no place for, or where that
+    takes nothing from what they publish; else by vectors, with the reason."""
+    try:
+        by_velocity = estimate_by_velocity(readings, epochs, tables, s)
+    except (UnusableFlight, EstimationError) as error:
+        return noted(_with_vectors(readings, tables, s, by_vps), not_taken(error.reason_code, str(error)))
+    if by_velocity.status == Status.OK and travelled(epochs, readings):
+        return by_velocity
+    by_vectors = _with_vectors(readings, tables, s, by_vps)
+    if better(by_velocity, by_vectors):
+        return by_velocity
+    code = ReasonCode.OTHER_METHOD_CHOSEN if by_velocity.status == Status.OK else by_velocity.reason_code
+    return noted(by_vectors, {**not_taken(code, by_velocity.reason), "by_velocity": by_velocity.measured})
 
 
 def _with_vps(found: ByVps, readings: Readings, tables: Tables, s: JointSettings, poses: AdmittedPoses) -> StageResult:
@@ -101,7 +108,7 @@ def _with_vps(found: ByVps, readings: Readings, tables: Tables, s: JointSettings
         elif isinstance(by_pose, TriadByPose):
             triads[sensor] = _by_pose(by_pose, sensor, s)
     measured = {
-        **measured_of(fit, _axes(s)),
+        **measured_of(fit, axes_of(s)),
         **found.measured,
         "rung": Rung.BY_VPS,
         "terms": model_selection.summary(tests, fit),
@@ -122,25 +129,11 @@ def _by_pose(triad: TriadByPose, sensor: Sensor, s: JointSettings) -> Found:
             nominal_scale=s.nominal_scale[sensor],
             max_scale_sd=s.ellipsoid_max_scale_sd,
         )
-    return _found(triad.matrix, triad.bias, triad.diagonal_covariance, triad.cross_sd, codes, priors(s).get(sensor))
-
-
-def _found(
-    matrix: Array,
-    bias: Array,
-    covariance: Array,
-    cross_sd: Array | None,
-    codes: list[ReasonCode | None],
-    prior: PriorConstants | None,
-) -> Found:
-    scale = np.diagonal(matrix)
-    slope = np.hstack([np.diag(bias / scale**2), np.diag(-1.0 / scale)])
-    zero_sd = np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0.0))
-    return Found(matrix, bias, covariance, cross_sd, codes, judged_zeros(codes, zero_sd, prior))
+    return found_of(triad.matrix, triad.bias, triad.diagonal_covariance, triad.cross_sd, codes, priors(s).get(sensor))
 
 
 def _with_vectors(readings: Readings, tables: Tables, s: JointSettings, by_vps: Mapping[str, Json]) -> StageResult:
-    axes = _axes(s)
+    axes = axes_of(s)
     try:
         outcome = fit_with_fallbacks(readings, start_constants(tables, s, readings), priors(s), lever_arm=_lever_arm(s))
     except UnusableFlight as error:
@@ -169,38 +162,9 @@ def _with_vectors(readings: Readings, tables: Tables, s: JointSettings, by_vps: 
     return replace(result, tables={**result.tables, **told, **_held_out(fit, readings, tables, s)})
 
 
-def chosen(s: JointSettings) -> tuple[Sensor, ...]:
-    """Sensors whose constants this method is to give."""
-    return tuple(name for name in SENSORS if s.method[name] != Approach.SERIAL)
-
-
-def priors(s: JointSettings) -> dict[str, PriorConstants]:
-    """What is known of each sensor whose unit, or nominal scale, is."""
-    zero = {
-        Sensor.GYROSCOPE: np.radians(s.prior_gyroscope_zero_dps),
-        Sensor.ACCELEROMETER: s.prior_accelerometer_zero_mps2,
-        Sensor.MAGNETOMETER: s.prior_magnetometer_zero * float(np.linalg.norm(s.field_ned)),
-    }
-    out = {}
-    for sensor in SENSORS:
-        nominal = s.nominal_scale[sensor]
-        if nominal is None:
-            continue
-        scale = np.asarray(nominal) * np.asarray(s.polarity[sensor], dtype=float)
-        covariance = np.diag(np.r_[(s.prior_scale_sd * scale) ** 2, np.full(3, zero[sensor] ** 2)])
-        if sensor == Sensor.MAGNETOMETER:
-            covariance[:3, :3] += s.prior_magnetometer_scale_sd**2 * np.outer(scale, scale)
-        out[str(sensor)] = PriorConstants(scale, np.zeros(3), covariance)
-    return out
-
-
-def _axes(s: JointSettings) -> Array:
-    return sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
-
-
 def _lever_arm(s: JointSettings) -> Array | None:
     """As measured on the vehicle, sensor axes."""
-    return None if s.lever_arm_m is None else np.asarray(_axes(s).T @ np.asarray(s.lever_arm_m, dtype=float))
+    return None if s.lever_arm_m is None else np.asarray(axes_of(s).T @ np.asarray(s.lever_arm_m, dtype=float))
 
 
 def _held_out(fit: JointFit, readings: Readings, tables: Tables, s: JointSettings) -> dict[str, pl.DataFrame]:
@@ -245,7 +209,7 @@ def _of_fit(fit: JointFit, sensor: Sensor, s: JointSettings) -> Found:
     )
     # A held accelerometer tells no zero either.
     held = ReasonCode.HELD_AT_NOMINAL in codes and sensor != Sensor.GYROSCOPE
-    return _found(full, bias, covariance, cross_sd, codes, None if held else priors(s).get(sensor))
+    return found_of(full, bias, covariance, cross_sd, codes, None if held else priors(s).get(sensor))
 
 
 def _written(
@@ -281,7 +245,7 @@ def _written(
     rows += beside_rows(
         fit,
         by_pose,
-        _axes(s),
+        axes_of(s),
         told,
         gyroscope_unit=s.units[Sensor.GYROSCOPE],
         temperature_degc=mean_temperature(tables),
@@ -305,12 +269,12 @@ def _written(
         fit,
         {sensor: found.codes for sensor, found in triads.items()},
         by_pose,
-        _axes(s),
+        axes_of(s),
         units={sensor: (UNITS[sensor] or s.field_unit, s.units[sensor]) for sensor in SENSORS},
         temperature_degc=mean_temperature(tables),
     )
     if fit.vps is not None or not any(_of_fit(fit, Sensor.GYROSCOPE, s).codes):
-        result["trajectory"] = _trajectory(attitude, tables, _axes(s))
+        result["trajectory"] = trajectory_table(attitude, tables, axes_of(s))
     return StageResult(result, Status.REFUSED if every else Status.OK, first, reason, measured)
 
 
@@ -331,13 +295,4 @@ def _slope_rows(
         logged_unit=s.units[Sensor.GYROSCOPE],
         temperature_degc=mean_temperature(tables),
         reason_code=codes,
-    )
-
-
-def _trajectory(attitude: Array, tables: Tables, axes: Array) -> pl.DataFrame:
-    """Attitude of the body at every sample."""
-    samples = tables["samples"]
-    q = multiply(attitude, from_matrix(axes))
-    return samples.select("t_ns", "segment").with_columns(
-        **{name: pl.Series(values) for name, values in columns_of(q, QUATERNION).items()}
     )

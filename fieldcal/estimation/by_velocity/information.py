@@ -1,0 +1,37 @@
+"""What a record says of the constants by a receiver's velocity, whatever was known beforehand: its normal equations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fieldcal.estimation.by_velocity.fit import VelocityFit
+from fieldcal.estimation.by_velocity.problem import TRIADS
+from fieldcal.estimation.joint.information import AXES, GAIN, ZERO
+from fieldcal.estimation.normal_equations import Name, NormalEquations
+
+
+def observed(fit: VelocityFit) -> NormalEquations:
+    """Of `gain` 1/λ and `zero` of each triad, logged units; lag, arm and field eliminated, whatever they are.
+
+    The prior stands beside the knots, so that the information without it is that of the record; at the solution the
+    record's gradient is what `pull` says. Clipped residuals enlarge it as they do the estimate's covariance."""
+    sizes = {name: columns.stop - columns.start for name, columns in fit.layout.items()}
+    names = tuple((name, "", str(k)) for name, size in sizes.items() for k in range(size))
+    theta = np.concatenate([fit.state.values[name] for name in fit.layout])
+    own = NormalEquations(names, theta, fit.pull / fit.inflation, fit.information / fit.inflation)
+    triads = [name for name in TRIADS if name in fit.layout]
+    own = own.of([name for name in names if name[0] in triads])
+    published: list[Name] = []
+    value, jacobian = np.zeros(6 * len(triads)), np.zeros((6 * len(triads), 6 * len(triads)))
+    for place, name in enumerate(triads):
+        published += [(name, parameter, axis) for parameter in (GAIN, ZERO) for axis in AXES]
+        one, other = fit.state.values[name][:3], fit.state.values[name][3:]
+        at = slice(6 * place, 6 * place + 6)
+        if name == "magnetometer":
+            value[at], jacobian[at, at] = np.r_[one, other], np.eye(6)
+        else:
+            value[at] = np.r_[1.0 / one, -other / one]
+            jacobian[at, at] = np.block(
+                [[np.diag(-1.0 / one**2), np.zeros((3, 3))], [np.diag(other / one**2), np.diag(-1.0 / one)]]
+            )
+    return own.as_function(published, value, jacobian)
