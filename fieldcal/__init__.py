@@ -83,6 +83,7 @@ __all__ = [
     "fit_ellipsoid",
     "fit_joint",
     "fit_output_error",
+    "ordinary_flight",
     "plot",
     "read_log",
     "simulate",
@@ -151,6 +152,7 @@ _NAMES_OF = {
         "SimulatedFlight",
         "simulate",
     ),
+    "simulation.ordinary": ("ordinary_flight",),
     "warehouse.errors": ("WarehouseError",),
 }
 """Module → public names. They are loaded when they are asked for: `fieldcal --help` needs none of them."""
@@ -184,6 +186,7 @@ if TYPE_CHECKING:
     from fieldcal.exports.refit import Refit
     from fieldcal.simulation.archive import write_flights
     from fieldcal.simulation.experiment import Experiment, SimulatedFlight, simulate
+    from fieldcal.simulation.ordinary import ordinary_flight
     from fieldcal.warehouse.errors import WarehouseError
 else:  # mypy is not shown this: it would let every misspelt name pass
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -23,14 +24,15 @@ def simulate(
     /,
     *,
     seed: Whole = 0,
+    motion: Literal["manoeuvre", "mission", "lively", "hover", "fixed_wing"] = "manoeuvre",
     log_format: Annotated[Literal["mcap", "csv", "ulog"], Parameter(name="--format")] = "mcap",
     vehicles: Whole = 1,
     sessions: Whole = 1,
     flights: Whole = 1,
-    duration: float = 40.0,
+    duration: float | None = None,
     translation_rms: float = 0.0,
     lever_arm: str = "0,0,0",
-    dip_deg: float = 0.0,
+    dip_deg: float | None = None,
     temperature: str = "25,25",
     bias_per_degc: list[str] | None = None,
     scale_per_degc: list[str] | None = None,
@@ -57,18 +59,21 @@ def simulate(
         Archive to write: FOLDER/<vehicle>/<session>/<flight>, with its fieldcal.toml.
     seed
         Equal seeds give equal logs.
+    motion
+        What is flown: the paper's manoeuvre near one place, or an ordinary flight of a multirotor or fixed wing with an
+        autopilot's sensors in SI units, the velocity of a satellite receiver, and no VPS.
     log_format
         One MCAP file a flight, a folder of CSVs, or one ULog file.
     vehicles, sessions, flights
         How many vehicles, sessions of each, flights in each.
     duration
-        Seconds.
+        Seconds; of the manoeuvre 40, of an ordinary flight 120.
     translation_rms
         Translation, rms of the acceleration vector, m/s².
     lever_arm
         x,y,z from the centre of mass to the sensor, body axes, m.
     dip_deg
-        Magnetic dip, degrees; 0 is the paper's horizontal field.
+        Magnetic dip, degrees; of the manoeuvre 0, the paper's horizontal field.
     temperature
         from,to in °C over a flight.
     bias_per_degc, scale_per_degc
@@ -91,12 +96,15 @@ def simulate(
     from fieldcal.cli.show import print_json
     from fieldcal.words.talk import say
 
-    experiment = fieldcal.Experiment(
+    own = fieldcal.Experiment() if motion == "manoeuvre" else fieldcal.ordinary_flight(motion, seed)
+    duration = own.duration_s if duration is None else duration
+    experiment = replace(
+        own,
         seed=seed,
         duration_s=duration,
         translation_rms_mps2=translation_rms,
         lever_arm_m=_triple("--lever-arm", lever_arm),
-        dip_rad=math.radians(dip_deg),
+        dip_rad=own.dip_rad if dip_deg is None else math.radians(dip_deg),
         temperature_degc=_pair("--temperature", temperature),
         bias_per_degc=_by_sensor("--bias-per-degc", bias_per_degc),
         scale_per_degc=_by_sensor("--scale-per-degc", scale_per_degc),
@@ -110,7 +118,7 @@ def simulate(
         noise=not no_noise,
         quantisation=not no_quantisation,
         band_limit=not no_band_limit,
-        vps=not no_vps,
+        vps=own.vps and not no_vps,
     )
     for name, value, lowest in (
         ("--duration", duration, 5.0),

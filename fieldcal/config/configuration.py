@@ -143,6 +143,9 @@ class McapMap(Table):
     temperature: Text | None = None
     power: Text | None = None
     position: Text | None = None
+    gnss_velocity: Annotated[
+        Text | None, _meaning("velocity of a satellite receiver: east, north, up, as ROS drivers have it")
+    ] = None
     imu_fields: Annotated[ImuFields | None, _meaning("fields of the IMU's message: one vector, or three numbers")] = (
         None
     )

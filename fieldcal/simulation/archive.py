@@ -15,15 +15,17 @@ import polars as pl
 from fieldcal.config.configuration import parse
 from fieldcal.config.flight_settings import FlightSettings, flight_settings
 from fieldcal.errors import FieldcalError
-from fieldcal.logs.mcap.write import pose_channel, raw_imu_channel, write_mcap
+from fieldcal.logs.interface import SIGNAL_COLUMNS
+from fieldcal.logs.mcap.write import pose_channel, raw_imu_channel, velocity_channel, write_mcap
 from fieldcal.logs.ulog.write import Rows, write_ulog
 from fieldcal.names import SENSORS, Sensor
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.simulation.experiment import Experiment, SimulatedFlight, constants_at, simulate
+from fieldcal.simulation.ordinary import ordinary_flight
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, triad
 
 FIRST_FLIGHT = datetime(2026, 1, 12, 8, 0, tzinfo=UTC)
-LATENCY_NS = {"imu": 400_000, "vps": 4_800_000}
+LATENCY_NS = {"imu": 400_000, "vps": 4_800_000, "gnss": 9_000_000}
 
 
 def write_flights(
@@ -95,7 +97,11 @@ def write_flights(
 
 
 def _varied(e: Experiment, vehicle: int) -> Experiment:
-    """Another unit of the same type: scales ±3 %, zeros ±300 counts."""
+    """Another unit of the same type: scales ±3 %, zeros ±300 counts; of one that logs units, as `ordinary` draws it."""
+    if e.logged == "si":
+        other = ordinary_flight(e.motion, int(np.random.SeedSequence([e.seed, 77, vehicle]).generate_state(1)[0]))
+        own = {"scale": other.scale, "bias": other.bias, "gnss_lag_s": other.gnss_lag_s, "gnss_arm_m": other.gnss_arm_m}
+        return replace(e, **own)  # type: ignore[arg-type]
     rng = np.random.default_rng([e.seed, 77, vehicle])
     scale: dict[str, tuple[float, float, float]] = {}
     bias: dict[str, tuple[float, float, float]] = {}
@@ -107,6 +113,12 @@ def _varied(e: Experiment, vehicle: int) -> Experiment:
         offset = -new * zero
         bias[name] = (float(offset[0]), float(offset[1]), float(offset[2]))
     return replace(e, scale=scale, bias=bias)
+
+
+def _units(e: Experiment) -> dict[str, str]:
+    """Of the logged readings."""
+    si = ("norm", "m/s^2", "rad/s")
+    return dict(zip(map(str, SENSORS), si if e.logged == "si" else ("counts",) * 3, strict=True))
 
 
 def _vehicle_table(vehicle_id: str, e: Experiment) -> str:
@@ -121,7 +133,7 @@ def _vehicle_table(vehicle_id: str, e: Experiment) -> str:
         f"gravity_mps2 = {e.gravity_mps2!r}",
         f'field = {{ north_east_down = {field!r}, unit = "norm" }}',
         "polarity = { " + ", ".join(f"{k} = {v!r}" for k, v in polarity.items()) + " }",
-        'units = { magnetometer = "counts", accelerometer = "counts", gyroscope = "counts" }',
+        "units = { " + ", ".join(f'{name} = "{unit}"' for name, unit in _units(e).items()) + " }",
     ]
     if any(e.lever_arm_m):
         lines.append(f"lever_arm_m = {list(e.lever_arm_m)!r}")
@@ -168,6 +180,11 @@ def signals(r: SimulatedFlight) -> dict[str, pl.DataFrame]:
     if r.current_a is not None:
         nothing = pl.lit(None, pl.Float64).alias("throttle")
         out["power"] = pl.DataFrame({"t_ns": t_ns, "current_a": r.current_a}).with_columns(nothing)
+    if len(r.gnss_t):
+        velocity = np.column_stack([r.gnss_velocity, r.gnss_sd])
+        gnss_ns = np.rint(r.gnss_t * 1e9).astype(np.int64)
+        names = SIGNAL_COLUMNS["gnss_velocity"][1:]
+        out["gnss_velocity"] = pl.DataFrame({"t_ns": gnss_ns, **columns_of(velocity, names)})
     if len(r.vps_t):
         pose = np.hstack([r.vps_q, r.vps_position])
         vps_ns = np.rint(r.vps_t * 1e9).astype(np.int64)
@@ -179,13 +196,14 @@ def settings(e: Experiment, vehicle_id: str = "sim-1", **changes: object) -> Fli
     """Flight settings of a simulated vehicle, as its fieldcal.toml gives them, but for method serial, whose stages are
     what most look at; `changes` replace parameters."""
     vehicle = parse(_vehicle_table(vehicle_id, e), None).vehicle(vehicle_id)
-    own = flight_settings(vehicle, units=dict.fromkeys(SENSORS, "counts"))
+    own = flight_settings(vehicle, units=_units(e))
     return own.changed(**{"method": "serial", **changes})
 
 
 def _write_mcap(path: Path, r: SimulatedFlight, t_ns: np.ndarray, vps_ns: np.ndarray, start_ns: int) -> None:
     """Raw counts and VPS poses as ROS 2 messages; log times are the recorder's, stamps each device's own."""
-    counts = {k: v.astype(np.uint16) if r.experiment.quantisation else v for k, v in r.counts.items()}
+    whole = r.experiment.quantisation and r.experiment.logged == "counts"
+    counts = {k: v.astype(np.uint16) if whole else v for k, v in r.counts.items()}
     channels = [
         raw_imu_channel(
             t_ns,
@@ -201,7 +219,10 @@ def _write_mcap(path: Path, r: SimulatedFlight, t_ns: np.ndarray, vps_ns: np.nda
         seen = (r.vps_t - e.vps_offset_s) / (1 + 1e-6 * e.vps_skew_ppm)
         seen_ns = start_ns + np.rint(seen * 1e9).astype(np.int64) + LATENCY_NS["vps"]
         channels.append(pose_channel(vps_ns, seen_ns, r.vps_q, r.vps_position))
-    units = {f"unit_{name}": "counts" for name in SENSORS}
+    if len(r.gnss_t):
+        gnss_ns = start_ns + np.rint(r.gnss_t * 1e9).astype(np.int64)
+        channels.append(velocity_channel(gnss_ns, gnss_ns + LATENCY_NS["gnss"], r.gnss_velocity, r.gnss_sd))
+    units = {f"unit_{name}": unit for name, unit in _units(r.experiment).items()}
     write_mcap(path, channels, metadata={**units, "world": "ned", "body": "frd", "gravity_sign": "gravity"})
 
 
@@ -223,12 +244,17 @@ def _write_ulog(path: Path, r: SimulatedFlight, start_ns: int) -> None:
         topics.append(
             Rows("vehicle_mocap_odometry", {"timestamp": vps_us, "timestamp_sample": vps_us, **pose, **frame})
         )
+    if len(r.gnss_t):
+        gnss_us = np.rint(r.gnss_t * 1e6).astype(np.uint64)
+        ways = {f"vel_{way}_m_s": r.gnss_velocity[:, i].astype(np.float32) for i, way in enumerate("ned")}
+        fix = {"s_variance_m_s": r.gnss_sd.astype(np.float32), "fix_type": np.full(len(gnss_us), 3, np.uint8)}
+        topics.append(Rows("vehicle_gps_position", {"timestamp": gnss_us, **ways, **fix}))
     write_ulog(path, topics, infos={"sys_name": "PX4", "boot_time_utc_us": start_ns // 1000})
 
 
 def _write_csv(folder: Path, r: SimulatedFlight) -> None:
     """imu.csv and vps.csv under the default column names, time in seconds from the start, every digit that counts."""
-    kind = pl.UInt16 if r.experiment.quantisation else pl.Float64
+    kind = pl.UInt16 if r.experiment.quantisation and r.experiment.logged == "counts" else pl.Float64
     names = {Sensor.GYROSCOPE: "g", Sensor.ACCELEROMETER: "a", Sensor.MAGNETOMETER: "m"}
     imu = {f"{short}{axis}": r.counts[name][:, i] for name, short in names.items() for i, axis in enumerate(AXES)}
     frame = pl.DataFrame({k: pl.Series(v).cast(kind) for k, v in imu.items()})
@@ -263,6 +289,8 @@ class Truth(TypedDict):
     vps_world_rotation_xyzw: list[float]
     vps_body_rotation_xyzw: list[float]
     lever_arm_m: list[float]
+    gnss_lag_s: float | None
+    gnss_lever_arm_m: list[float] | None
     dip_rad: float
     translation_rms_mps2: float
     seed: int
@@ -285,6 +313,8 @@ def truth(r: SimulatedFlight) -> Truth:
         "vps_world_rotation_xyzw": r.vps_world_rotation.tolist(),
         "vps_body_rotation_xyzw": r.vps_body_rotation.tolist(),
         "lever_arm_m": list(e.lever_arm_m),
+        "gnss_lag_s": r.gnss_lag_s if len(r.gnss_t) else None,
+        "gnss_lever_arm_m": list(e.gnss_arm_m) if len(r.gnss_t) else None,
         "dip_rad": e.dip_rad,
         "translation_rms_mps2": e.translation_rms_mps2,
         "seed": e.seed,

@@ -20,21 +20,32 @@ LARGEST_ARM_M = 0.3
 DIP_RAD = 1.1
 
 
-def ordinary_flight(motion: Flown, seed: int, **changes: object) -> Experiment:
+def ordinary_flight(motion: str, seed: int = 0, **changes: object) -> Experiment:
     """An experiment of an ordinary flight: constants, lag and antenna arm are drawn by the seed.
 
     Parameters
     ----------
-    motion : Flown
+    motion : {"mission", "lively", "hover", "fixed_wing"}
         What is flown.
     seed : int
         Of everything.
     **changes
         Replace fields of the experiment.
 
+    Returns
+    -------
+    Experiment
+        For `simulate` and `write_flights`.
+
+    Raises
+    ------
+    ValueError
+        No such motion.
+
     Examples
     --------
-    >>> e = ordinary_flight(Flown.LIVELY, 3)
+    >>> import fieldcal
+    >>> e = fieldcal.ordinary_flight("lively", seed=3, duration_s=60.0)
     >>> e.logged, e.vps, 0.04 < e.gnss_lag_s < 0.26
     ('si', False, True)
     """
@@ -43,7 +54,7 @@ def ordinary_flight(motion: Flown, seed: int, **changes: object) -> Experiment:
     bias = {name: _three(sd * rng.normal(size=3)) for name, sd in ZERO_SD.items()}
     own = Experiment(
         seed=seed,
-        motion=motion,
+        motion=Flown(motion),
         logged="si",
         duration_s=120.0,
         dip_rad=DIP_RAD,

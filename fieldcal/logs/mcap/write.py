@@ -126,6 +126,24 @@ def pose_channel(
     return _stamped(topic, "geometry_msgs/PoseStamped", t_ns, log_time_ns, values, frame_id)
 
 
+def velocity_channel(
+    t_ns: ArrayLike,
+    log_time_ns: ArrayLike | None,
+    velocity_ned_mps: ArrayLike,
+    sd_mps: ArrayLike,
+    *,
+    topic: str = "/gnss/fix_velocity",
+    frame_id: str = "gnss",
+) -> MessageChannel:
+    """`geometry_msgs/TwistWithCovarianceStamped` of a satellite receiver: m/s, (n, 3) north-east-down, written east,
+    north, up as ROS drivers do, and its standard deviation, (n,)."""
+    ned = _vectors(velocity_ned_mps, 3)
+    covariance = np.zeros((len(ned), 36))
+    covariance[:, [0, 7, 14]] = np.asarray(sd_mps, np.float64)[:, None] ** 2
+    values = {"twist.twist.linear": ned[:, [1, 0, 2]] * [1.0, 1.0, -1.0], "twist.covariance": covariance}
+    return _stamped(topic, "geometry_msgs/TwistWithCovarianceStamped", t_ns, log_time_ns, values, frame_id)
+
+
 def raw_imu_channel(
     t_ns: ArrayLike,
     log_time_ns: ArrayLike | None,

@@ -144,6 +144,8 @@ class MessageLog:
             for number, component in enumerate(COMPONENTS[3]):
                 columns[f"p{component}_m"] = values["position"][:, number].copy()
             yield "vps", columns
+        elif source.role == "gnss_velocity":
+            yield "gnss_velocity", _velocity(t_ns, values)
         else:
             yield "position", {"t_ns": t_ns, **values}
 
@@ -219,6 +221,17 @@ def _columns(t_ns: NDArray[np.int64], values: dict[str, NDArray[np.float64]], se
     columns: Columns = {"t_ns": t_ns}
     for sensor in sensors:
         columns |= triad(sensor, values[sensor])
+    return columns
+
+
+def _velocity(t_ns: NDArray[np.int64], values: dict[str, NDArray[np.float64]]) -> Columns:
+    """Of a receiver, which has it east, north and up; its sd is the mean of the axes', where the message tells."""
+    east, north, up = values["velocity"].T
+    columns: Columns = {"t_ns": t_ns, "velocity_north_mps": north.copy(), "velocity_east_mps": east.copy()}
+    columns["velocity_down_mps"] = -up
+    if "covariance" in values:
+        variance = values["covariance"][:, [0, 7, 14]].mean(axis=1)
+        columns["velocity_sd_mps"] = np.sqrt(np.where(variance > 0.0, variance, np.nan))
     return columns
 
 

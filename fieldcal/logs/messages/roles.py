@@ -50,6 +50,13 @@ KNOWN_TYPES: Mapping[str, Mapping[str, Mapping[str, Want]]] = {
     "temperature": {"sensor_msgs/Temperature": {"temperature": Want.of("temperature", 1)}},
     "power": {"sensor_msgs/BatteryState": {"current": Want.of("current", 1)}},
     "position": {"sensor_msgs/NavSatFix": _POSITION, "foxglove/LocationFix": _POSITION},
+    "gnss_velocity": {
+        "geometry_msgs/TwistWithCovarianceStamped": {
+            "velocity": Want.of("twist.twist.linear", 3),
+            "covariance": Want.of("twist.covariance", 36),
+        },
+        "geometry_msgs/TwistStamped": {"velocity": Want.of("twist.linear", 3)},
+    },
     "vps": {
         "geometry_msgs/PoseStamped": _POSE,
         "geometry_msgs/PoseWithCovarianceStamped": _NESTED_POSE,
@@ -64,9 +71,11 @@ KNOWN_TYPES: Mapping[str, Mapping[str, Mapping[str, Want]]] = {
 SI_TYPES = ("sensor_msgs/Imu", "sensor_msgs/MagneticField")
 FEW_SHARE = 0.01
 """Topics with fewer than this share of the messages of the busiest one that could play a role are commands."""
-OPTIONAL = ("magnetometer", "temperature", "power", "position", "vps")
+OPTIONAL = ("magnetometer", "temperature", "power", "position", "gnss_velocity", "vps")
 """Roles that a flight may lack although they are configured."""
 _HINTS = {"imu": ("raw",), "magnetometer": ("raw",), "vps": ("vps", "mocap", "vrpn", "optitrack", "vicon")}
+_REQUIRED_HINTS = {"gnss_velocity": ("fix_vel", "gnss", "gps", "ublox", "navsat")}
+"""Roles that no message type tells: a twist may be a command, or a wheel's."""
 
 
 def choose_sources(
@@ -83,7 +92,8 @@ def choose_sources(
     definitions : Definitions
         Schemas and channels of the file.
     mapping : McapMap
-        Configured topics (`imu`, `magnetometer`, `vps`, `temperature`, `power`, `position`) and `imu_fields`.
+        Configured topics (`imu`, `magnetometer`, `vps`, `temperature`, `power`, `position`, `gnss_velocity`) and
+        `imu_fields`.
     summary : LogSummary
         Receives findings.
     log_name : str
@@ -206,7 +216,8 @@ def _by_type(
     for topic, channels in sorted(definitions.by_topic().items()):
         type_name = type_name_of(channels[0], definitions)
         wants = _wants(role, type_name, fields)
-        if wants is None:
+        needed = _REQUIRED_HINTS.get(role)
+        if wants is None or (needed is not None and not any(hint in topic.lower() for hint in needed)):
             continue
         try:
             decoders = _decoders(channels, definitions, wants)

@@ -15,6 +15,7 @@ from fieldcal.estimation.by_velocity.fit import ARM_SD_M, UNKNOWN_FIELD_SD_RAD, 
 from fieldcal.estimation.by_velocity.information import observed
 from fieldcal.estimation.by_velocity.problem import LARGEST_LAG_S, SMALLEST_LAG_S, Epochs
 from fieldcal.estimation.joint.information import GAIN
+from fieldcal.estimation.joint.ladder import LEAST_TILT
 from fieldcal.estimation.joint.problem import PriorConstants, Readings
 from fieldcal.estimation.normal_equations import Name
 from fieldcal.geometry.rotation import Array
@@ -42,10 +43,10 @@ VELOCITY = ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps")
 GNSS_LAG, GNSS_LEVER_ARM = "gnss_lag", "gnss_lever_arm"
 # Sd beyond which a number says nothing and is no row: s, and of what was known before.
 LARGEST_LAG_SD_S, LARGEST_ARM_SD_M = 0.05, 0.5 * ARM_SD_M
-# Rms of an axis' specific force about its mean, over g: with less, axes out of square by a fraction of a degree and
-# thrust along z pass for its scale, however small its sd. A level axis of a vehicle that banks to accelerate feels drag
-# alone.
-LEAST_FORCE_SHARE = 0.1
+# Rms of an axis' specific force about its mean, over g, as for a triad by vectors: with less, axes out of square by a
+# fraction of a degree pass for its scale, however small its sd. A level axis of a vehicle that banks to accelerate
+# feels drag alone.
+LEAST_FORCE_SHARE = LEAST_TILT
 # The receiver's noise over what it claims, and the velocity's own walk, m/s in a second: more, and one of them is not
 # what it is taken for.
 LARGEST_RECEIVER_RATIO, LARGEST_PUSH_MPS = 5.0, 0.5
