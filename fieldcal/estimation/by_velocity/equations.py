@@ -105,8 +105,9 @@ def _links(
     here[:, 3:, :3] = there[:, 3:, :3] = 0.5 * cross
     here[:, 3:, 3:], there[:, 3:, 3:] = -eye, eye
     turned = frame[joined] @ path.turn_by_gyroscope[joined]
-    theta[:, :3, layout["gyroscope"]] = -turned
-    theta[:, 3:, layout["gyroscope"]] = -frame[joined] @ path.push_by_gyroscope[joined] - 0.5 * cross @ turned
+    gyroscope = slice(layout["gyroscope"].start, layout["drift"].stop)
+    theta[:, :3, gyroscope] = -turned
+    theta[:, 3:, gyroscope] = -frame[joined] @ path.push_by_gyroscope[joined] - 0.5 * cross @ turned
     theta[:, 3:, layout["accelerometer"]] = -frame[joined] @ path.push_by_accelerometer[joined]
     variance = np.empty((m, 6))
     variance[:, :3] = (levels.turn * interval)[:, None]
@@ -131,7 +132,8 @@ def _receiver(
     epoch = setting.knots.epoch[knot]
     arm, rate = state.values["arm"], path.rate[knot]
     swung = np.einsum("nij,nj->ni", attitude[knot], np.cross(rate, arm))
-    residual = state.velocity[knot] + swung - setting.epochs.velocity[epoch]
+    jerk = np.einsum("nij,nj->ni", frame[knot], path.jerk[knot])
+    residual = state.velocity[knot] + swung + state.values["smoothing"] * jerk - setting.epochs.velocity[epoch]
     here, theta = np.zeros((len(knot), 3, 6)), np.zeros((len(knot), 3, p))
     here[:, :, 3:], here[:, :, :3] = np.eye(3), -skew(swung)
     theta[:, :, layout["arm"]] = attitude[knot] @ skew(rate)
@@ -139,6 +141,7 @@ def _receiver(
     swing = np.cross(path.rate_change[knot], arm) + np.cross(rate, np.cross(rate, arm))
     acceleration += np.einsum("nij,nj->ni", attitude[knot], swing)
     theta[:, :, layout["lag"]] = -acceleration[:, :, None]
+    theta[:, :, layout["smoothing"]] = jerk[:, :, None]
     by_rate = -attitude[knot] @ skew(arm)
     gyroscope = layout["gyroscope"]
     theta[:, :, gyroscope.start : gyroscope.start + 3] += by_rate * path.rate_logged[knot][:, None, :]
@@ -171,7 +174,7 @@ def _field(
     theta[:, range(3), range(columns.start + 3, columns.stop)] = 1.0
     theta[:, :, layout["field"]] = gain[:, None] * (seen @ slopes)
     turned = path.axes[knot] @ skew(np.einsum("nij,j->ni", back, field)) @ path.axes_by_gyroscope[knot]
-    theta[:, :, layout["gyroscope"]] = gain[:, None] * turned
+    theta[:, :, layout["gyroscope"].start : layout["drift"].stop] = gain[:, None] * turned
     residual = gain * sensed + zero - path.reading[knot]
     variance = np.full(residual.shape, levels.field * levels.colour[2])
     return Rows(residual, here, None, theta, knot, variance, (FIELD,) * 3)

@@ -54,6 +54,9 @@ from fieldcal.reason_codes import ReasonCode
 # What is known of a receiver beforehand.
 LAG_S, LAG_SD_S = 0.12, 0.15
 ARM_SD_M = 0.5
+SMOOTHING_SD_S2 = 1e-3  # that of a mean over 0.15 s
+# Of a gyroscope's bias, as it warms: 0.05 °/s a minute.
+DRIFT_SD_RADPS2 = 1.5e-5
 # Of the field's dip and declination where its place is known: a model's error and a vehicle's steel; elsewhere.
 FIELD_SD_RAD, UNKNOWN_FIELD_SD_RAD = 0.03, 0.5
 UNKNOWN_SD_MPS = 0.3  # of a velocity of which the receiver does not say
@@ -119,7 +122,9 @@ class VelocityFit:
 
     def attitude(self, readings: Readings) -> Array:
         """At every sample (n, 4), sensor axes, NED: the gyroscope's integral turned onto the knots."""
-        rate = readings.gyroscope * self.state.values["gyroscope"][:3] + self.state.values["gyroscope"][3:]
+        values = self.state.values
+        since_middle = (readings.t - 0.5 * (readings.t[0] + readings.t[-1]))[:, None]
+        rate = readings.gyroscope * values["gyroscope"][:3] + values["gyroscope"][3:] + since_middle * values["drift"]
         relative = propagate_stretches(readings.t, rate, readings.segment)
         at = self.setting.knots.offset - self.state.lag_s
         own = slerp(readings.t, relative, at)
@@ -215,7 +220,8 @@ class _Fit:
             values["field"] = np.zeros(2)
         else:
             values.pop("magnetometer", None)
-        values |= {"lag": np.array([LAG_S]), "arm": np.zeros(3)}
+        values |= {"drift": np.zeros(3), "lag": np.array([LAG_S]), "smoothing": np.zeros(1), "arm": np.zeros(3)}
+        self.middle_s = 0.5 * float(readings.t[0] + readings.t[-1])
         self.layout = layout_of(values)
         self.sign = float(np.sign(readings.gravity_mps2))
         grid = grid_of(readings, self.knots, LAG_S)
@@ -233,12 +239,14 @@ class _Fit:
         field_variance = float(np.sum(self.setting.field**2)) * 0.05**2
         if with_field:
             field_variance *= float(np.mean(values["magnetometer"][:3] ** 2))
+        self.least_receiver = float((LEAST_SD_MPS / np.median(epochs.sd)) ** 2)
         self.levels = Levels(
             START_RATIO * self.noise_turn, START_RATIO * self.noise_push, np.ones(2), field_variance, np.ones(3)
         )
 
     def _integrated(self, grid: Grid, values: Mapping[str, Array]) -> Integrated:
-        return integrate(grid, values["gyroscope"], values["accelerometer"], self.sign)
+        triads = values["gyroscope"], values["drift"], values["accelerometer"]
+        return integrate(grid, *triads, self.sign, self.middle_s)
 
     def _prior(self, priors: Mapping[str, PriorConstants], field_known: bool) -> tuple[Array, Array]:
         """Information (p, p) and expected values (p,) of the constants."""
@@ -256,7 +264,13 @@ class _Fit:
             elif name in TRIADS:
                 expected[columns] = self.state.values[name]
         sd = FIELD_SD_RAD if field_known else UNKNOWN_FIELD_SD_RAD
-        for name, value, own_sd in (("field", 0.0, sd), ("lag", LAG_S, LAG_SD_S), ("arm", 0.0, ARM_SD_M)):
+        for name, value, own_sd in (
+            ("drift", 0.0, DRIFT_SD_RADPS2),
+            ("field", 0.0, sd),
+            ("lag", LAG_S, LAG_SD_S),
+            ("smoothing", 0.0, SMOOTHING_SD_S2),
+            ("arm", 0.0, ARM_SD_M),
+        ):
             if name in self.layout:
                 at = np.arange(self.layout[name].start, self.layout[name].stop)
                 information[at, at], expected[at] = own_sd**-2, value
@@ -351,6 +365,8 @@ class _Fit:
         # Walks are no less than what the triads' noise makes.
         ratio[TURN] = max(ratio[TURN], self.noise_turn / old.turn)
         ratio[PUSH] = max(ratio[PUSH], self.noise_push / old.push)
+        # A receiver is no better than what it is rounded to.
+        ratio[[LEVEL, VERTICAL]] = np.maximum(ratio[[LEVEL, VERTICAL]], self.least_receiver / old.receiver)
         self.change = float(np.max(np.abs(ratio[given] - 1.0) * np.minimum(1.0, np.sqrt(0.5 * information))))
         return Levels(
             old.turn * ratio[TURN],

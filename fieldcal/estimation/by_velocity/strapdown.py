@@ -70,14 +70,16 @@ def grid_of(readings: Readings, knots: Knots, lag_s: float) -> Grid:
 
 @dataclass(frozen=True)
 class Integrated:
-    """A record integrated with some constants, axes of its beginning ("frame 0"); parameters (λ, b) of a triad.
+    """A record integrated with some constants, axes of its beginning ("frame 0"); parameters (λ, b) of a triad, of the
+    gyroscope the drift of its bias too.
 
     At knots: `turned` (K, 3, 3) sensor axes there to frame 0; `rate` (K, 3) rad/s, sensor axes, and its derivative
-    `rate_change` (K, 3) rad/s²; `force` (K, 3) m/s².
-    Over intervals: `push` (K−1, 3) m/s, integral of specific force; `turn_by_gyroscope` (K−1, 3, 6) ∂(rotation vector
-    of the end's attitude), `push_by_gyroscope`, `push_by_accelerometer` (K−1, 3, 6) ∂push.
+    `rate_change` (K, 3) rad/s²; `force` (K, 3) m/s² and its
+    derivative `jerk` (K, 3) m/s³, frame 0.
+    Over intervals: `push` (K−1, 3) m/s, integral of specific force; `turn_by_gyroscope` (K−1, 3, 9) ∂(rotation vector
+    of the end's attitude), `push_by_gyroscope` (K−1, 3, 9), `push_by_accelerometer` (K−1, 3, 6) ∂push.
     Of the magnetometer over intervals: `count` (K−1,) readings, `reading` (K−1, 3) their mean, `axes` (K−1, 3, 3) mean
-    of frame 0 to sensor axes, `axes_by_gyroscope` (K−1, 3, 6) mean rotation since the knot by the constants.
+    of frame 0 to sensor axes, `axes_by_gyroscope` (K−1, 3, 9) mean rotation since the knot by the constants.
     `rate_logged` (K, 3): the gyroscope's reading at the knots."""
 
     turned: Array
@@ -85,6 +87,7 @@ class Integrated:
     rate_change: Array
     rate_logged: Array
     force: Array
+    jerk: Array
     push: Array
     turn_by_gyroscope: Array
     push_by_gyroscope: Array
@@ -95,11 +98,15 @@ class Integrated:
     axes_by_gyroscope: Array
 
 
-def integrate(grid: Grid, gyroscope: Array, accelerometer: Array, gravity_sign: float) -> Integrated:
-    """Integrate with constants (λ, b) (6,) of both triads; `gravity_sign` 1 for an accelerometer that reads gravity.
+def integrate(
+    grid: Grid, gyroscope: Array, drift: Array, accelerometer: Array, gravity_sign: float, middle_s: float
+) -> Integrated:
+    """Integrate with constants (λ, b) (6,) of both triads and the drift (3,) of the gyroscope's bias about `middle_s`;
+    `gravity_sign` 1 for an accelerometer that reads gravity.
 
     Trapezoids between samples; the attitude with the second-order term of a linear rate."""
-    rate = grid.gyroscope * gyroscope[:3] + gyroscope[3:]
+    since_middle = (grid.t - middle_s)[:, None]
+    rate = grid.gyroscope * gyroscope[:3] + gyroscope[3:] + drift * since_middle
     force = -gravity_sign * (grid.accelerometer * accelerometer[:3] + accelerometer[3:])
     q = cumulative_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], from_rotation_vector(rotation_steps(grid.t, rate))]))
     turned = body_from_inertial(q).transpose(0, 2, 1)
@@ -111,7 +118,8 @@ def integrate(grid: Grid, gyroscope: Array, accelerometer: Array, gravity_sign: 
         np.cumsum((x[1:] + x[:-1]) * half.reshape(-1, *[1] * (x.ndim - 1)), axis=0, out=out[1:])
         return out
 
-    by_gyroscope = total(np.concatenate([turned * grid.gyroscope[:, None, :], turned], axis=2))
+    drifted = turned * since_middle[..., None]
+    by_gyroscope = total(np.concatenate([turned * grid.gyroscope[:, None, :], turned, drifted], axis=2))
     of_force = total(-gravity_sign * np.concatenate([turned * grid.accelerometer[:, None, :], turned], axis=2))
     moved = total(in_frame)
     turned_away = total(skew(in_frame) @ by_gyroscope)
@@ -122,7 +130,7 @@ def integrate(grid: Grid, gyroscope: Array, accelerometer: Array, gravity_sign: 
     count = np.bincount(grid.interval, minlength=intervals).astype(float)[:intervals]
 
     def mean(x: Array) -> Array:
-        flat = x.reshape(len(x), -1)
+        flat = x.reshape(len(x), int(np.prod(x.shape[1:])))
         sums = np.stack([np.bincount(grid.interval, c, minlength=intervals)[:intervals] for c in flat.T], axis=1)
         return np.asarray(sums / np.maximum(count, 1.0)[:, None]).reshape(intervals, *x.shape[1:])
 
@@ -134,6 +142,7 @@ def integrate(grid: Grid, gyroscope: Array, accelerometer: Array, gravity_sign: 
         rate_change=(_slope(grid.t, angle, at + NEAR_S) - _slope(grid.t, angle, at - NEAR_S)) / (2.0 * NEAR_S),
         rate_logged=_slope(grid.t, total(grid.gyroscope), at),
         force=_slope(grid.t, moved, at),
+        jerk=(_slope(grid.t, moved, at + NEAR_S) - _slope(grid.t, moved, at - NEAR_S)) / (2.0 * NEAR_S),
         push=push,
         turn_by_gyroscope=np.diff(by_gyroscope[knot], axis=0),
         push_by_gyroscope=by_push,
