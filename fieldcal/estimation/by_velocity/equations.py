@@ -175,7 +175,10 @@ def _field(
     theta[:, :, layout["field"]] = gain[:, None] * (seen @ slopes)
     turned = path.axes[knot] @ skew(np.einsum("nij,j->ni", back, field)) @ path.axes_by_gyroscope[knot]
     theta[:, :, layout["gyroscope"].start : layout["drift"].stop] = gain[:, None] * turned
-    residual = gain * sensed + zero - path.reading[knot]
+    # What is late by δ shows the field of axes that were turned by ω δ less.
+    passing = gain * np.cross(path.axes_rate[knot], sensed)
+    theta[:, :, layout["delay"]] = passing[:, :, None]
+    residual = gain * sensed + zero + state.values["delay"] * passing - path.reading[knot]
     variance = np.full(residual.shape, levels.field * levels.colour[2])
     return Rows(residual, here, None, theta, knot, variance, (FIELD,) * 3)
 

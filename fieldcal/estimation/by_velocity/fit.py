@@ -57,6 +57,7 @@ ARM_SD_M = 0.5
 SMOOTHING_SD_S2 = 1e-3  # that of a mean over 0.15 s
 # Of a gyroscope's bias, as it warms: 0.05 °/s a minute.
 DRIFT_SD_RADPS2 = 1.5e-5
+DELAY_SD_S = 0.05  # of a magnetometer behind the gyroscope
 # Of the field's dip and declination where its place is known: a model's error and a vehicle's steel; elsewhere.
 FIELD_SD_RAD, UNKNOWN_FIELD_SD_RAD = 0.03, 0.5
 UNKNOWN_SD_MPS = 0.3  # of a velocity of which the receiver does not say
@@ -217,7 +218,7 @@ class _Fit:
         if with_field:
             scale, bias = start["magnetometer"]
             values["magnetometer"] = np.r_[1.0 / scale, -bias / scale]
-            values["field"] = np.zeros(2)
+            values |= {"field": np.zeros(2), "delay": np.zeros(1)}
         else:
             values.pop("magnetometer", None)
         values |= {"drift": np.zeros(3), "lag": np.array([LAG_S]), "smoothing": np.zeros(1), "arm": np.zeros(3)}
@@ -267,6 +268,7 @@ class _Fit:
         for name, value, own_sd in (
             ("drift", 0.0, DRIFT_SD_RADPS2),
             ("field", 0.0, sd),
+            ("delay", 0.0, DELAY_SD_S),
             ("lag", LAG_S, LAG_SD_S),
             ("smoothing", 0.0, SMOOTHING_SD_S2),
             ("arm", 0.0, ARM_SD_M),

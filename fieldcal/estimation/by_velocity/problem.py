@@ -18,13 +18,15 @@ SIZES = {
     "accelerometer": 6,
     "magnetometer": 6,
     "field": 2,
+    "delay": 1,
     "lag": 1,
     "smoothing": 1,
     "arm": 3,
 }
 """Unknowns beside the knots, in their order: scale and bias of the gyroscope, and how its bias changes with time,
 rad/s², about the middle of the record; scale and bias of the accelerometer; gain and zero of the magnetometer
-(readings = gain · field + zero); dip and declination of the field, rad, less those configured; the receiver's lag, s,
+(readings = gain · field + zero); dip and declination of the field, rad, less those configured, and the
+magnetometer's delay behind the gyroscope, s; the receiver's lag, s,
 and what it adds of the velocity's second derivative, s² (T²/24 of a mean over T); from the sensor to its antenna, m,
 sensor axes."""
 LARGEST_LAG_S, SMALLEST_LAG_S = 0.6, -0.2

@@ -79,7 +79,8 @@ class Integrated:
     Over intervals: `push` (K−1, 3) m/s, integral of specific force; `turn_by_gyroscope` (K−1, 3, 9) ∂(rotation vector
     of the end's attitude), `push_by_gyroscope` (K−1, 3, 9), `push_by_accelerometer` (K−1, 3, 6) ∂push.
     Of the magnetometer over intervals: `count` (K−1,) readings, `reading` (K−1, 3) their mean, `axes` (K−1, 3, 3) mean
-    of frame 0 to sensor axes, `axes_by_gyroscope` (K−1, 3, 9) mean rotation since the knot by the constants.
+    of frame 0 to sensor axes, `axes_by_gyroscope` (K−1, 3, 9) mean rotation since the knot by the constants, and
+    `axes_rate` (K−1, 3) mean rate, rad/s, sensor axes.
     `rate_logged` (K, 3): the gyroscope's reading at the knots."""
 
     turned: Array
@@ -96,6 +97,7 @@ class Integrated:
     reading: Array
     axes: Array
     axes_by_gyroscope: Array
+    axes_rate: Array
 
 
 def integrate(
@@ -151,6 +153,7 @@ def integrate(
         reading=mean(grid.magnetometer),
         axes=mean(turned[grid.seen].transpose(0, 2, 1)),
         axes_by_gyroscope=mean(since),
+        axes_rate=mean(rate[grid.seen]),
     )
 
 
