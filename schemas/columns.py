@@ -223,7 +223,7 @@ METHOD = Column(
     "method",
     _TEXT,
     "",
-    "estimator that made the row: ellipsoid, ellipsoid_robust, equation_error, output_error, joint, ...",
+    "estimator that made the row: ellipsoid, ellipsoid_robust, equation_error, output_error, joint, velocity, ...",
 )
 PARAMETER = Column(
     "parameter",
@@ -231,7 +231,8 @@ PARAMETER = Column(
     "",
     "scale, bias: z = scale * logged + bias, sensor axes; zero = -bias/scale; zero_bias: z at the reference reading; "
     "zero_per_degc: slope of the zero; lever_arm, vps_lever_arm: from the point the vehicle turns about, or the VPS's "
-    "point, to the sensor, body axes; delay behind the gyroscope or the trajectory; dip of the field; g_sensitivity of "
+    "point, to the sensor, body axes; gnss_lag of a satellite receiver's velocity, and gnss_lever_arm from the sensor "
+    "to its antenna, body axes; delay behind the gyroscope or the trajectory; dip of the field; g_sensitivity of "
     "the reading to specific force (the zero is that at the flight's mean force); field_per_current, "
     "field_per_throttle: what the motors add to the reading; residual_...: of readings that an autopilot had corrected "
     "before it logged them, beside which the others are the raw sensor's; in `information` gain, zero: reading = gain "

@@ -20,7 +20,7 @@ from fieldcal.stages.inputs import differentiate_by_segment
 from fieldcal.stages.tables import QUATERNION, constants, matrix, seconds, triad
 from fieldcal.stages.vps import RATE_COLUMNS, interpolate_attitude
 
-GYRO_METHODS = (Method.EQUATION_ERROR, Method.OUTPUT_ERROR, Method.JOINT)
+GYRO_METHODS = (Method.EQUATION_ERROR, Method.OUTPUT_ERROR, Method.JOINT, Method.VELOCITY)
 
 
 @dataclass(frozen=True)

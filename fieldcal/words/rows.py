@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 BESIDE = {
     "lever_arm": "lever arm (from the point it turns about)",
     "vps_lever_arm": "lever arm (from the VPS's point)",
+    "gnss_lag": "lag (of the satellite receiver)",
+    "gnss_lever_arm": "lever arm (to the receiver's antenna)",
     "delay": "delay",
     "dip": "dip of the field",
     "g_sensitivity": "sensitivity to specific force",

@@ -193,7 +193,8 @@ def noise_in_readings(links: Rows, state: State, layout: Mapping[str, slice]) ->
         jump = np.einsum("nij,nj->ni", back, links.residual[:, rows])
         share = np.sum(jump**2 / links.variance[:, rows], axis=0)
         first = layout[name].start
-        out[first : first + 3] = share / state.values[name][:3]
+        # Jumps larger than their noise are the start's errors.
+        out[first : first + 3] = np.where(share < len(jump), share, 0.0) / state.values[name][:3]
     return out
 
 

@@ -86,8 +86,8 @@ COLOUR_S, LARGEST_COLOUR = 3.0, 400.0
 class VelocityFit:
     """Constants by a receiver's velocity.
 
-    `layout` places the constants of `state.values` in θ; `covariance` (p, p); `information` (p, p) of the record alone
-    and `pull` (p,) its gradient where the fit ended, both to be divided by `inflation`, which is in the covariance for
+    `layout` places the constants of `state.values` in θ; `covariance` (p, p); `information` (p, p) without what is
+    known of the triads and `pull` (p,) its gradient where the fit ended, both to be divided by `inflation`, which is in the covariance for
     what clipped residuals do not say; `levels`; residuals of the
     receiver `residual` (e, 3), m/s, at `t` (e,) s, with robust `weight` (e,); the magnetometer's mean robust weight;
     `noise_turn`, `noise_push`: what sample-to-sample noise makes of the levels `turn` and `push`; iterations."""
@@ -392,13 +392,18 @@ class _Fit:
         self, rows: list[Rows], weight: list[Array], solved: Solved, path: Integrated, iterations: int
     ) -> VelocityFit:
         receiver = rows[1]
+        # What is known of lag, arm, drift, … belongs to the record, what is known of the constants does not.
+        beside = np.ones(len(self.known), dtype=bool)
+        for name in TRIADS:
+            beside[self.layout.get(name, slice(0))] = False
+        theta = np.concatenate([self.state.values[name] for name in self.layout])
         inflation = huber_inflation(weight[1][:, 0])
         return VelocityFit(
             self.state,
             self.layout,
             solved.covariance * inflation,
-            solved.information,
-            solved.pull,
+            solved.information + np.where(np.outer(beside, beside), self.known, 0.0),
+            solved.pull + np.where(beside, self.known @ (self.expected - theta), 0.0),
             inflation,
             self.levels,
             self.knots.offset[receiver.knot],
