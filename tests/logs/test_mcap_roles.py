@@ -90,3 +90,16 @@ def test_refusals_list_twenty_topics_and_thirty_fields() -> None:
     assert refused.value.reason_code == "missing_field"
     assert "f29. " in refused.value.sentence
     assert "f30" not in refused.value.sentence
+
+
+@pytest.mark.parametrize(
+    ("topic", "type_name"),
+    [
+        ("/ublox/fix_velocity", "geometry_msgs/msg/TwistWithCovarianceStamped"),
+        ("/mavros/global_position/raw/gps_vel", "geometry_msgs/msg/TwistStamped"),
+    ],
+)
+def test_a_twist_is_a_receivers_velocity_by_its_name_alone(topic: str, type_name: str) -> None:
+    assert chosen(IMU | {topic: type_name})[0]["gnss_velocity"].topic == topic
+    assert "gnss_velocity" not in chosen(IMU | {"/cmd_vel": type_name})[0]
+    assert chosen(IMU | {"/vel": type_name}, gnss_velocity="/vel")[0]["gnss_velocity"].topic == "/vel"

@@ -87,10 +87,10 @@ class VelocityFit:
     """Constants by a receiver's velocity.
 
     `layout` places the constants of `state.values` in θ; `covariance` (p, p); `information` (p, p) without what is
-    known of the triads and `pull` (p,) its gradient where the fit ended, both to be divided by `inflation`, which is in the covariance for
-    what clipped residuals do not say; `levels`; residuals of the
-    receiver `residual` (e, 3), m/s, at `t` (e,) s, with robust `weight` (e,); the magnetometer's mean robust weight;
-    `noise_turn`, `noise_push`: what sample-to-sample noise makes of the levels `turn` and `push`; iterations."""
+    known of the triads and `pull` (p,) its gradient where the fit ended, both to be divided by `inflation`, which is in
+    the covariance for what clipped residuals do not say. `residual` (e, 3) of the receiver, m/s, at `t` (e,) s, with
+    robust `weight` (e,); `field_weight` mean of the magnetometer's; `setting` and `path`, the record as it was
+    integrated last."""
 
     state: State
     layout: Mapping[str, slice]
@@ -103,8 +103,6 @@ class VelocityFit:
     residual: Array
     weight: Array
     field_weight: float
-    noise_turn: float
-    noise_push: float
     iterations: int
     setting: Setting
     path: Integrated
@@ -410,8 +408,6 @@ class _Fit:
             -receiver.residual,
             weight[1][:, 0],
             float(weight[2].mean()) if len(weight) > 2 else 1.0,
-            self.noise_turn,
-            self.noise_push,
             iterations,
             self.setting,
             path,
