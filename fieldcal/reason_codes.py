@@ -272,6 +272,8 @@ class ReasonCode(StrEnum):
     """A scale is not half to twice the nominal one."""
     TRANSLATION_DOMINATES = "translation_dominates"
     """The accelerometer reads too much beside gravity to tell its constants."""
+    UNDERSAMPLED = "undersampled"
+    """The readings change faster than they come: what was between them is not known."""
     HELD_AT_NOMINAL = "held_at_nominal"
     """The recording tells nothing of it: the value is the one known beforehand."""
     PRIOR_CONTRADICTED = "prior_contradicted"

@@ -247,8 +247,9 @@ def _write_ulog(path: Path, r: SimulatedFlight, start_ns: int) -> None:
     if len(r.gnss_t):
         gnss_us = np.rint(r.gnss_t * 1e6).astype(np.uint64)
         ways = {f"vel_{way}_m_s": r.gnss_velocity[:, i].astype(np.float32) for i, way in enumerate("ned")}
-        fix = {"s_variance_m_s": r.gnss_sd.astype(np.float32), "fix_type": np.full(len(gnss_us), 3, np.uint8)}
-        topics.append(Rows("vehicle_gps_position", {"timestamp": gnss_us, **ways, **fix}))
+        fix, sd = np.full(len(gnss_us), 3, np.uint8), r.gnss_sd.astype(np.float32)
+        row = {"timestamp": gnss_us, **ways, "s_variance_m_s": sd, "fix_type": fix}
+        topics.append(Rows("vehicle_gps_position", row))
     write_ulog(path, topics, infos={"sys_name": "PX4", "boot_time_utc_us": start_ns // 1000})
 
 

@@ -204,7 +204,8 @@ class Solved:
 
     `information` (p, p) of the constants, knots eliminated, without the prior, and its gradient `pull` (p,);
     `covariance` (p, p) with the prior; `probes`: the same step for the probe of each group of rows, what of it the
-    unknowns take, `theta` (p, 5), `knots` (K, 6, 5)."""
+    unknowns take, `theta` (p, 5), `knots` (K, 6, 5); `followed` (K, 6, p): by how much the knots follow the
+    constants."""
 
     theta: Array
     knots: Array
@@ -212,6 +213,7 @@ class Solved:
     covariance: Array
     pull: Array
     probes: tuple[Array, Array]
+    followed: Array
 
 
 def solve(
@@ -260,7 +262,16 @@ def solve(
     theta = inverse @ gradient
     whole = carried[:, :, p:] - carried[:, :, :p] @ theta
     probes = theta[:, 1:], whole[..., 1:]
-    return Solved(theta[:, 0], whole[..., 0], information, inverse, gradient[:, 0] - pulled, probes)
+    return Solved(theta[:, 0], whole[..., 0], information, inverse, gradient[:, 0] - pulled, probes, -carried[:, :, :p])
+
+
+def pulls(one: Rows, weight: Array, residual: Array, followed: Array) -> Array:
+    """What each row (m,) does to the gradient of the constants, knots eliminated, (m, p): `residual` (m, r) over its
+    sd and √`weight`."""
+    sensitivity = one.theta + one.here @ followed[one.knot]
+    if one.there is not None:
+        sensitivity = sensitivity + one.there @ followed[one.knot + 1]
+    return np.asarray(np.einsum("mrp,mr->mp", sensitivity, residual * np.sqrt(weight / one.variance)))
 
 
 def predicted(one: Rows, theta: Array, knots: Array) -> Array:

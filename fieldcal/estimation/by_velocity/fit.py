@@ -20,6 +20,7 @@ from fieldcal.estimation.by_velocity.equations import (
     Solved,
     noise_in_readings,
     predicted,
+    pulls,
     rows_of,
     solve,
 )
@@ -39,7 +40,7 @@ from fieldcal.estimation.gyroscope.output_error import propagate_stretches
 from fieldcal.estimation.joint.problem import PriorConstants, Readings
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.smoothing import fill, lattice
-from fieldcal.estimation.statistics import huber_inflation, power_density, robust_sigma
+from fieldcal.estimation.statistics import huber_inflation, power_density, robust_sigma, variance_by_blocks
 from fieldcal.geometry.rotation import (
     Array,
     body_from_inertial,
@@ -87,17 +88,15 @@ class VelocityFit:
     """Constants by a receiver's velocity.
 
     `layout` places the constants of `state.values` in θ; `covariance` (p, p); `information` (p, p) without what is
-    known of the triads and `pull` (p,) its gradient where the fit ended, both to be divided by `inflation`, which is in
-    the covariance for what clipped residuals do not say. `residual` (e, 3) of the receiver, m/s, at `t` (e,) s, with
-    robust `weight` (e,); `field_weight` mean of the magnetometer's; `setting` and `path`, the record as it was
-    integrated last."""
+    known of the triads and `pull` (p,) its gradient where the fit ended. `residual` (e, 3) of the receiver, m/s, at `t`
+    (e,) s, with robust `weight` (e,); `field_weight` mean of the magnetometer's; `setting` and `path`, the record as it
+    was integrated last."""
 
     state: State
     layout: Mapping[str, slice]
     covariance: Array
     information: Array
     pull: Array
-    inflation: float
     levels: Levels
     t: Array
     residual: Array
@@ -135,8 +134,8 @@ class VelocityFit:
             inside = (at >= first) & (at <= last)
             # A stretch without an epoch takes the offset of its neighbour: its heading is anyone's guess.
             which = np.flatnonzero(inside) if inside.any() else np.array([int(np.argmin(np.abs(at - first)))])
-            times, values = at[which], continuous(offset[which])
-            carried = slerp(times, values, np.clip(readings.t[here], *times[[0, -1]])) if len(times) > 1 else values
+            times, turned = at[which], continuous(offset[which])
+            carried = slerp(times, turned, np.clip(readings.t[here], *times[[0, -1]])) if len(times) > 1 else turned
             out[here] = multiply(carried, relative[here])
         return out
 
@@ -395,14 +394,15 @@ class _Fit:
         for name in TRIADS:
             beside[self.layout.get(name, slice(0))] = False
         theta = np.concatenate([self.state.values[name] for name in self.layout])
-        inflation = huber_inflation(weight[1][:, 0])
+        wider = np.sqrt(huber_inflation(weight[1][:, 0])) * self._wider(rows, weight, solved)
+        narrower = np.outer(1.0 / wider, 1.0 / wider)
+        information = solved.information + np.where(np.outer(beside, beside), self.known, 0.0)
         return VelocityFit(
             self.state,
             self.layout,
-            solved.covariance * inflation,
-            solved.information + np.where(np.outer(beside, beside), self.known, 0.0),
-            solved.pull + np.where(beside, self.known @ (self.expected - theta), 0.0),
-            inflation,
+            solved.covariance * np.outer(wider, wider),
+            information * narrower,
+            (solved.pull + np.where(beside, self.known @ (self.expected - theta), 0.0)) / wider,
             self.levels,
             self.knots.offset[receiver.knot],
             -receiver.residual,
@@ -412,6 +412,19 @@ class _Fit:
             self.setting,
             path,
         )
+
+    def _wider(self, rows: list[Rows], weight: list[Array], solved: Solved) -> Array:
+        """Factors (p,) on the sd, 1 at least: what blocks of time do to each constant may vary by more than noise of
+        the fitted levels would have it."""
+        moved, t = [], []
+        for one, robust in zip(rows, weight, strict=True):
+            residual = one.residual * np.sqrt(robust / one.variance)
+            moved.append(pulls(one, robust, residual, solved.followed) @ solved.covariance)
+            t.append(self.knots.offset[one.knot])
+        times = np.concatenate(t)
+        order = np.argsort(times, kind="stable")
+        variance = variance_by_blocks(np.concatenate(moved)[order], times[order])
+        return np.asarray(np.sqrt(np.maximum(1.0, variance / np.diagonal(solved.covariance))))
 
 
 def _walk(readings: Readings, logged: Array, scale: Array) -> float:

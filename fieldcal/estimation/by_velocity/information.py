@@ -14,11 +14,11 @@ def observed(fit: VelocityFit) -> NormalEquations:
     """Of `gain` 1/λ and `zero` of each triad, logged units; lag, arm and field eliminated, whatever they are.
 
     The prior stands beside the knots, so that the information without it is that of the record; at the solution the
-    record's gradient is what `pull` says. Clipped residuals enlarge it as they do the estimate's covariance."""
+    record's gradient is what `pull` says."""
     sizes = {name: columns.stop - columns.start for name, columns in fit.layout.items()}
     names = tuple((name, "", str(k)) for name, size in sizes.items() for k in range(size))
     theta = np.concatenate([fit.state.values[name] for name in fit.layout])
-    own = NormalEquations(names, theta, fit.pull / fit.inflation, fit.information / fit.inflation)
+    own = NormalEquations(names, theta, fit.pull, fit.information)
     triads = [name for name in TRIADS if name in fit.layout]
     own = own.of([name for name in names if name[0] in triads])
     published: list[Name] = []

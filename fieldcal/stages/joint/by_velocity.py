@@ -47,6 +47,9 @@ LARGEST_LAG_SD_S, LARGEST_ARM_SD_M = 0.05, 0.5 * ARM_SD_M
 # fraction of a degree pass for its scale, however small its sd. A level axis of a vehicle that banks to accelerate
 # feels drag alone.
 LEAST_FORCE_SHARE = LEAST_TILT
+# Of readings that come more slowly than this, s: rms of what lies between two neighbours' mean and the reading there,
+# over the readings' own. A vehicle's vibration, logged at 25 Hz without its filter, has 0.4–1, motion alone 0.2.
+SLOW_S, LARGEST_BETWEEN_SHARE = 0.02, 0.3
 # The receiver's noise over what it claims, and the velocity's own walk, m/s in a second: more, and one of them is not
 # what it is taken for.
 LARGEST_RECEIVER_RATIO, LARGEST_PUSH_MPS = 5.0, 0.5
@@ -90,7 +93,11 @@ def estimate_by_velocity(readings: Readings, epochs: Epochs, tables: Tables, s: 
             start[Sensor.MAGNETOMETER] = np.diagonal(found[0]).copy(), found[1]
             known.setdefault(Sensor.MAGNETOMETER, _unknown(start[Sensor.MAGNETOMETER], s))
     fit = fit_by_velocity(readings, epochs, start, known, field_known=s.field_source != FIELD_ASSUMED)
-    triads = {sensor: _judged(fit, sensor, s, known[sensor]) for sensor in chosen(s) if sensor in fit.layout}
+    triads = {
+        sensor: _judged(fit, sensor, s, known[sensor], unshown(fit, readings, sensor))
+        for sensor in chosen(s)
+        if sensor in fit.layout
+    }
     return _written(fit, triads, readings, tables, s)
 
 
@@ -113,7 +120,24 @@ def doubt(fit: VelocityFit) -> ReasonCode | None:
     return None
 
 
-def _judged(fit: VelocityFit, sensor: Sensor, s: JointSettings, prior: PriorConstants) -> Found:
+def unshown(fit: VelocityFit, readings: Readings, sensor: Sensor) -> list[ReasonCode | None]:
+    """Why an axis' scale is none that this motion shows, however small its sd, or None."""
+    logged = {Sensor.GYROSCOPE: readings.gyroscope, Sensor.ACCELEROMETER: readings.accelerometer}.get(sensor)
+    if logged is None:
+        return [None] * 3
+    x = logged[np.isfinite(logged).all(axis=1)]
+    between = x[1:-1] - 0.5 * (x[:-2] + x[2:])
+    slow = float(np.median(np.diff(readings.t))) > SLOW_S
+    unknown = slow & (np.sqrt(np.mean(between**2, axis=0)) > LARGEST_BETWEEN_SHARE * x.std(axis=0))
+    felt = force_share(fit) >= LEAST_FORCE_SHARE if sensor == Sensor.ACCELEROMETER else np.ones(3, dtype=bool)
+    return [
+        ReasonCode.UNDERSAMPLED if unknown[i] else None if felt[i] else ReasonCode.HELD_AT_NOMINAL for i in range(3)
+    ]
+
+
+def _judged(
+    fit: VelocityFit, sensor: Sensor, s: JointSettings, prior: PriorConstants, unseen: list[ReasonCode | None]
+) -> Found:
     scale, bias, covariance = fit.constants(sensor)
     limit = s.gyro_max_scale_sd if sensor == Sensor.GYROSCOPE else s.ellipsoid_max_scale_sd
     before = np.sqrt(np.diagonal(prior.covariance))
@@ -135,9 +159,7 @@ def _judged(fit: VelocityFit, sensor: Sensor, s: JointSettings, prior: PriorCons
         )
         told = np.sqrt(np.diagonal(covariance)[:3]) < INFORMED_SHARE * before[:3]
         codes = [own or (None if told[i] else ReasonCode.SCALE_UNCERTAIN) for i, own in enumerate(codes)]
-        if sensor == Sensor.ACCELEROMETER:
-            felt = force_share(fit) >= LEAST_FORCE_SHARE
-            codes = [own or (None if felt[i] else ReasonCode.HELD_AT_NOMINAL) for i, own in enumerate(codes)]
+        codes = [own or unseen[i] for i, own in enumerate(codes)]
     return found_of(np.diag(scale), bias, covariance, None, codes, prior)
 
 
@@ -188,7 +210,7 @@ def _written(
     result = {
         "calibration": calibration_rows(rows),
         "covariance": covariance_table(fit.covariance),
-        "information": _information(fit, triads, s, temperature),
+        "information": _information(fit, triads, readings, s, temperature),
     }
     if Sensor.GYROSCOPE in triads and not any(triads[Sensor.GYROSCOPE].codes):
         result["trajectory"] = trajectory_table(fit.attitude(readings), tables, axes)
@@ -231,7 +253,11 @@ def _receiver_rows(
 
 
 def _information(
-    fit: VelocityFit, triads: Mapping[Sensor, Found], s: JointSettings, temperature_degc: float | None
+    fit: VelocityFit,
+    triads: Mapping[Sensor, Found],
+    readings: Readings,
+    s: JointSettings,
+    temperature_degc: float | None,
 ) -> pl.DataFrame:
     """What the flight says of all constants together; of a sensor that contradicts itself, and of a scale that passes
     for something else, nothing counts."""
@@ -241,10 +267,9 @@ def _information(
     for sensor, own in triads.items():
         wrong = [code for code in own.codes if code is not None and code not in SCALE_ALONE]
         refused |= {name: wrong[0] for name in found.names if wrong and name[0] == sensor}
-    if Sensor.ACCELEROMETER in triads:
-        for axis, share in zip(AXES, force_share(fit), strict=True):
-            if share < LEAST_FORCE_SHARE:
-                refused.setdefault((str(Sensor.ACCELEROMETER), GAIN, axis), ReasonCode.HELD_AT_NOMINAL)
+        for axis, code in zip(AXES, unshown(fit, readings, sensor), strict=True):
+            if code is not None:
+                refused.setdefault((str(sensor), GAIN, axis), code)
     units = {sensor: (UNITS[sensor] or s.field_unit, s.units[sensor]) for sensor in SENSORS}
     table = table_of(found, [refused.get(name) for name in found.names], units)
     return table.with_columns(temperature_degc=pl.lit(temperature_degc, pl.Float64))

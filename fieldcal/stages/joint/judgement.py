@@ -20,7 +20,12 @@ MAX_GYRO_NOISE_SHARE = 0.5
 # off contradict it, and show that something is not as the model has it.
 HELD_SD, LARGEST_PRIOR_DISTANCE_SD = 1e-4, 4.0
 # Refusals that concern the scale alone, and the share of a prior sd that a recording has to leave to have told a zero.
-SCALE_ALONE = (ReasonCode.SCALE_UNCERTAIN, ReasonCode.AXIS_NOT_TURNED, ReasonCode.HELD_AT_NOMINAL)
+SCALE_ALONE = (
+    ReasonCode.SCALE_UNCERTAIN,
+    ReasonCode.AXIS_NOT_TURNED,
+    ReasonCode.HELD_AT_NOMINAL,
+    ReasonCode.UNDERSAMPLED,
+)
 INFORMED_SHARE = 0.5
 # Of the field's dip from the configured one, °: more is another place, or an accelerometer or world upside down.
 MAX_DIP_DIFFERENCE_DEG = 20.0
