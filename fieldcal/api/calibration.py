@@ -21,7 +21,7 @@ from fieldcal.flight.calibrate import CalibratedLog, LogRead, identify, overrule
 from fieldcal.flight.rows import rows_frame
 from fieldcal.geometry import sensor_model
 from fieldcal.logs.on_board import PRIMARY
-from fieldcal.names import SENSORS, Approach, Json, exactness
+from fieldcal.names import JOINT_METHODS, SENSORS, Approach, Json, exactness
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.rows import FlightDocument, Refusable, SyncRow
 from fieldcal.stages.composition import ORIGIN, in_log
@@ -242,7 +242,7 @@ class Calibration:
 
     def _why(self, sensor: str, method: str, code: str | None) -> str:
         """The sentence behind a refused row's code: of the stage that wrote it, else of any that has this code."""
-        names = ("joint",) if method == "joint" else STAGES[sensor]
+        names = ("joint",) if method in JOINT_METHODS else STAGES[sensor]
         own = [run for run in self.runs if run.stage in names and run.reason]
         same = [run for run in (*own, *self.runs) if run.reason_code == code and run.reason]
         return str(next((run.reason for run in (*same, *own)), f"reason code {code}."))

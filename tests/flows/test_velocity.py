@@ -17,7 +17,7 @@ from fieldcal.warehouse.upkeep.verify import verify
 
 def test_a_lively_flight_through_the_night(tmp_path: Path, prefect_server: str) -> None:
     archive, root = tmp_path / "archive", tmp_path / "warehouse"
-    write_flights(archive, ordinary_flight("lively", 31, duration_s=60.0))
+    write_flights(archive, ordinary_flight("lively", 31, duration_s=45.0))
     assert run_night(archive, root, None, None, 1)["ok"] == 1
     warehouse = Warehouse(root)
     rows = warehouse.sql("FROM latest_calibration WHERE parameter IN ('scale', 'zero')")

@@ -256,7 +256,7 @@ def solve(
     information, gradient = own - absorbed[:p, :p], own_right - absorbed[:p, p:]
     information = 0.5 * (information + information.T)
     total = information + prior
-    scale = 1.0 / np.sqrt(np.diagonal(total))
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(total), 1e-300))
     inverse = np.linalg.inv(total * np.outer(scale, scale)) * np.outer(scale, scale)
     gradient[:, 0] += pulled + score
     theta = inverse @ gradient

@@ -63,7 +63,7 @@ DELAY_SD_S = 0.05  # of a magnetometer behind the gyroscope
 FIELD_SD_RAD, UNKNOWN_FIELD_SD_RAD = 0.03, 0.5
 UNKNOWN_SD_MPS = 0.3  # of a velocity of which the receiver does not say
 LEAST_SD_MPS = 0.02
-FEWEST_EPOCHS = 50
+FEWEST_EPOCHS, FEWEST_FIELDS = 50, 20  # readings of the magnetometer, with fewer it is left out
 # Length of a row over its sd beyond which it loses influence, as in the joint estimate; the median of χ with three.
 CLIP_SD, MEDIAN_LENGTH = 4.0, 1.538
 MOST_ITERATIONS = 40
@@ -211,7 +211,7 @@ class _Fit:
         self.knots = place_knots(readings, epochs)
         gravity = np.array([0.0, 0.0, abs(readings.gravity_mps2)])
         values = {name: np.concatenate(start[name]) for name in TRIADS if name in start}
-        with_field = "magnetometer" in start and readings.magnetometer is not None
+        with_field = "magnetometer" in start and _between(readings, self.knots.offset) >= FEWEST_FIELDS
         if with_field:
             scale, bias = start["magnetometer"]
             values["magnetometer"] = np.r_[1.0 / scale, -bias / scale]
@@ -283,7 +283,7 @@ class _Fit:
             rows = rows_of(self.setting, self.state, path, self.levels, self.layout)
             if not self.signs:
                 self.signs = [rng.choice([-1.0, 1.0], size=one.residual.shape) for one in rows]
-                if len(rows) > 2:
+                if len(rows) > 2 and len(rows[2].knot):
                     self.levels = replace(self.levels, field=float(robust_sigma(rows[2].residual)) ** 2)
                     continue
             weight = self._weights(rows)
@@ -407,7 +407,7 @@ class _Fit:
             self.knots.offset[receiver.knot],
             -receiver.residual,
             weight[1][:, 0],
-            float(weight[2].mean()) if len(weight) > 2 else 1.0,
+            float(weight[2].mean()) if len(weight) > 2 and weight[2].size else 1.0,
             iterations,
             self.setting,
             path,
@@ -425,6 +425,14 @@ class _Fit:
         order = np.argsort(times, kind="stable")
         variance = variance_by_blocks(np.concatenate(moved)[order], times[order])
         return np.asarray(np.sqrt(np.maximum(1.0, variance / np.diagonal(solved.covariance))))
+
+
+def _between(readings: Readings, at: Array) -> int:
+    """How many readings of the magnetometer lie between the first knot and the last."""
+    if readings.magnetometer is None:
+        return 0
+    given = np.isfinite(readings.magnetometer).all(axis=1)
+    return int(np.sum(given & (readings.t > at[0]) & (readings.t < at[-1] - LARGEST_LAG_S)))
 
 
 def _walk(readings: Readings, logged: Array, scale: Array) -> float:
