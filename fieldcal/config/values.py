@@ -215,6 +215,7 @@ _IMU_COLUMNS = {
     "t": 1,
     **{str(sensor): 3 for sensor in SENSORS},
     **{"temperature": 1, "current": 1, "throttle": 1, "instance": 1},
+    **{"gnss_velocity": 3, "gnss_velocity_sd": 1},
 }
 _VPS_COLUMNS = {"t": 1, "quaternion_xyzw": 4, "quaternion_wxyz": 4, "roll_pitch_yaw": 3, "position": 3}
 _IMU_FIELDS = {**{str(sensor): 3 for sensor in SENSORS}, "temperature": 1}

@@ -260,7 +260,13 @@ def _write_csv(folder: Path, r: SimulatedFlight) -> None:
     imu = {f"{short}{axis}": r.counts[name][:, i] for name, short in names.items() for i, axis in enumerate(AXES)}
     frame = pl.DataFrame({k: pl.Series(v).cast(kind) for k, v in imu.items()})
     frame.insert_column(0, _seconds("t_s", r.t))
-    frame.with_columns(temp=pl.Series(np.round(r.temperature, 4))).write_csv(folder / "imu.csv")
+    frame = frame.with_columns(temp=pl.Series(np.round(r.temperature, 4)))
+    if len(r.gnss_t):
+        # Rows of their own: the receiver has its own stamps.
+        columns = columns_of(np.column_stack([r.gnss_velocity, r.gnss_sd]), SIGNAL_COLUMNS["gnss_velocity"][1:])
+        velocity = pl.DataFrame(columns).insert_column(0, _seconds("t_s", r.gnss_t))
+        frame = pl.concat([frame, velocity], how="diagonal").sort("t_s")
+    frame.write_csv(folder / "imu.csv")
     if len(r.vps_t):
         vps = pl.DataFrame({**columns_of(r.vps_q, QUATERNION), **columns_of(r.vps_position, ("px", "py", "pz"))})
         vps.insert_column(0, _seconds("t_s", r.vps_t)).write_csv(folder / "vps.csv")

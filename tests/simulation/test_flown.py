@@ -74,7 +74,7 @@ def test_lag_arm_and_constants_are_drawn_by_the_seed() -> None:
         ordinary_flight("loop", 1)
 
 
-@pytest.mark.parametrize("log_format", ["mcap", "ulog"])
+@pytest.mark.parametrize("log_format", ["mcap", "ulog", "csv"])
 def test_the_velocity_is_read_as_it_was_flown(tmp_path: Path, log_format: str) -> None:
     e = ordinary_flight("mission", 7, duration_s=10.0)
     write_flights(tmp_path, e, log_format=log_format)

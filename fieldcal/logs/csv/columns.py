@@ -25,6 +25,8 @@ IMU_DEFAULTS: dict[str, tuple[str, ...]] = {
     "temperature": ("temp",),
     "current": ("current_a",),
     "throttle": ("throttle",),
+    "gnss_velocity": ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps"),
+    "gnss_velocity_sd": ("velocity_sd_mps",),
 }
 VPS_DEFAULTS: dict[str, tuple[str, ...]] = {
     "quaternion_xyzw": ("qx", "qy", "qz", "qw"),
@@ -35,6 +37,7 @@ VPS_DEFAULTS: dict[str, tuple[str, ...]] = {
     "position": ("px", "py", "pz"),
 }
 AXES: dict[str, tuple[str, ...]] = {key: tuple(f"{key}_{axis}" for axis in "xyz") for key in SENSORS}
+VELOCITY_COLUMNS = {key: IMU_DEFAULTS[key] for key in ("gnss_velocity", "gnss_velocity_sd")}
 POWER_COLUMNS = {"current": ("current_a",), "throttle": ("throttle",)}
 VPS_COLUMNS = {
     "quaternion_xyzw": ("qx", "qy", "qz", "qw"),
@@ -45,7 +48,7 @@ VPS_COLUMNS = {
 }
 OTHER_ATTITUDES = ("roll_pitch_yaw", "rotation_matrix", "rotation_vector")
 """Attitudes of a VPS that become a quaternion."""
-OPTIONAL = ("temperature", "current", "throttle", "position")
+OPTIONAL = ("temperature", "current", "throttle", "gnss_velocity", "gnss_velocity_sd", "position")
 """What a log may lack although it is configured."""
 TIME_DEFAULTS = tuple(
     stem + suffix for stem in ("t", "time", "timestamp") for suffix in ("_s", "", "_ms", "_us", "_ns")
@@ -104,6 +107,10 @@ def signal_groups(
         ("magnetometer", [("magnetometer", AXES["magnetometer"])] if "magnetometer" in own else []),
         ("temperature", [("temperature", ("temperature_degc",))] if "temperature" in own else []),
         ("power", [(key, outs) for key, outs in POWER_COLUMNS.items() if key in own]),
+        (
+            "gnss_velocity",
+            [(key, outs) for key, outs in VELOCITY_COLUMNS.items() if "gnss_velocity" in own and key in own],
+        ),
         ("vps", [(key, outs) for key, outs in VPS_COLUMNS.items() if key in reference]),
     ]
 

@@ -280,7 +280,7 @@ class CsvTable:
             for key, _ in groups:
                 for place in columns.values[key]:
                     bad |= cells[str(place)][1]
-            required = [out for key, outs in groups for out in outs if key != "position"]
+            required = [out for key, outs in groups for out in outs if key not in ("position", "gnss_velocity_sd")]
             there = np.stack([np.isfinite(values[out]) for out in required])
             if table == "power":
                 there = np.stack([there.any(axis=0)])  # one of the two will do

@@ -39,6 +39,8 @@ from fieldcal.stages.tables import AXES, CalibrationRow, calibration_rows, covar
 if TYPE_CHECKING:
     from fieldcal.config.stage_settings import JointSettings
 
+# Share of epochs that bring a new velocity; with fewer it is held over the rows of a faster log.
+LEAST_FRESH = 0.9
 VELOCITY = ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps")
 GNSS_LAG, GNSS_LEVER_ARM = "gnss_lag", "gnss_lever_arm"
 # Sd beyond which a number says nothing and is no row: s, and of what was known before.
@@ -58,7 +60,7 @@ TRAVELLED_MPS = 1.0
 
 
 def epochs_of(tables: Tables, s: JointSettings) -> Epochs | None:
-    """The receiver's velocities on the clock of the samples; None without one, or where it is not wanted."""
+    """The receiver's velocities on the clock of the samples, each once; None without one, or where it is not wanted."""
     table = tables.get("gnss_velocity")
     if not s.use_velocity or table is None or table.is_empty():
         return None
@@ -66,6 +68,9 @@ def epochs_of(tables: Tables, s: JointSettings) -> Epochs | None:
     velocity, sd = matrix(table, VELOCITY), matrix(table, ["velocity_sd_mps"])[:, 0]
     order = np.argsort(t, kind="stable")
     known = order[np.isfinite(velocity[order]).all(axis=1)]
+    fresh = np.any(np.diff(velocity[known], axis=0) != 0.0, axis=1)
+    if len(known) > 1 and fresh.mean() < LEAST_FRESH:
+        known = known[np.r_[True, fresh]]
     return Epochs(t[known], velocity[known], sd[known]) if len(known) else None
 
 
