@@ -250,7 +250,7 @@ def test_a_wrong_unit_is_told_by_its_scale(flight: SimulatedFlight, sensor: str,
 
 
 def test_every_stage_reads_what_an_earlier_one_writes() -> None:
-    known = {f"ingest.{name}" for name in ("imu", "magnetometer", "temperature", "vps", "power")}
+    known = {f"ingest.{name}" for name in ("imu", "magnetometer", "temperature", "vps", "power", "gnss_velocity")}
     defaults = settings(Experiment())
     for stage in PIPELINE:
         assert set(stage.reads.values()) <= known, stage.name
