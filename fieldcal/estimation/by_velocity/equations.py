@@ -183,18 +183,22 @@ def _field(
     return Rows(residual, here, None, theta, knot, variance, (FIELD,) * 3)
 
 
-def noise_in_readings(links: Rows, state: State, layout: Mapping[str, slice]) -> Array:
+def noise_in_readings(
+    links: Rows, state: State, layout: Mapping[str, slice], turn_share: float, push_share: float
+) -> Array:
     """What is added to the gradient (p,) because readings, by which the sensitivity to a scale is made, have the noise
     that makes the attitude and velocity jump: without it a noisy gyroscope's scale comes out too small (as in
-    `joint.score_corrections`)."""
+    `joint.score_corrections`). Of both walks' variance only a share is that of readings: what a receiver errs for
+    seconds is in the velocity's walk, and in no reading."""
     out = np.zeros(links.theta.shape[2])
     back = body_from_inertial(state.q[links.knot])
-    for name, rows in (("gyroscope", slice(0, 3)), ("accelerometer", slice(3, 6))):
+    triads = (("gyroscope", slice(0, 3), turn_share), ("accelerometer", slice(3, 6), push_share))
+    for name, rows, of_readings in triads:
         jump = np.einsum("nij,nj->ni", back, links.residual[:, rows])
         share = np.sum(jump**2 / links.variance[:, rows], axis=0)
         first = layout[name].start
         # Jumps larger than their noise are the start's errors.
-        out[first : first + 3] = np.where(share < len(jump), share, 0.0) / state.values[name][:3]
+        out[first : first + 3] = of_readings * np.where(share < len(jump), share, 0.0) / state.values[name][:3]
     return out
 
 

@@ -291,7 +291,8 @@ class _Fit:
             score: Array
             pulled, score = self.known @ (self.expected - theta), np.zeros(len(theta))
             if iteration > ROUGH_ITERATIONS:
-                score = noise_in_readings(rows[0], self.state, self.layout)
+                shares = self.noise_turn / self.levels.turn, self.noise_push / self.levels.push
+                score = noise_in_readings(rows[0], self.state, self.layout, *shares)
             try:
                 solved = solve(rows, weight, len(self.knots.offset), (self.known, pulled), score, self.signs)
             except np.linalg.LinAlgError as error:
