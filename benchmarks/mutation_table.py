@@ -51,6 +51,7 @@ TESTS: dict[str, Sequence[str]] = {
     "estimation.joint": ("estimation/joint/test_*.py",),
     "estimation.motion_selection": ("estimation/test_motion_selection*.py",),
     "estimation.motor_field": ("estimation/test_motor_field*.py",),
+    "estimation.pooled": ("estimation/pooled/test_*.py",),
     "estimation.quadric": ("estimation/test_quadric*.py",),
     "estimation.robust": ("estimation/test_robust*.py",),
     "estimation.segments": ("estimation/test_segments*.py",),
