@@ -1366,8 +1366,18 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "return np.maximum([robust_sigma(r) for r in residual.T], 1e-12)",
         "1e-12 → 1.1000000000000002e-12",
     ): _GUARD,
-    ("estimation.by_pose.triad", "body_axes.lower", "q, left = q * signs, left * signs[:, None]", "* → /"): _SIGNS,
-    ("estimation.by_pose.triad", "body_axes.lower", "q, left = q * signs, left * signs[:, None]", "* → / #2"): _SIGNS,
+    (
+        "estimation.by_pose.triad",
+        "body_axes.lower",
+        "q, left = q * signs, np.tril(left * signs[:, None])  # exactly: rounding leaves dust",
+        "* → /",
+    ): _SIGNS,
+    (
+        "estimation.by_pose.triad",
+        "body_axes.lower",
+        "q, left = q * signs, np.tril(left * signs[:, None])  # exactly: rounding leaves dust",
+        "* → / #2",
+    ): _SIGNS,
     (
         "estimation.by_pose.triad",
         "body_axes",
@@ -1490,7 +1500,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): _GUARD,
     (
         "estimation.joint.covariance",
-        "covariance",
+        "noise_of",
         "variance = float(np.mean(left[left != 0.0] ** 2)) if left.any() else 1.0",
         "1.0 → 1.1",
     ): _OVER_ZEROS,
