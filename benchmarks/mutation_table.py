@@ -1499,6 +1499,12 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "1e-300 → 1.1000000000000002e-300",
     ): _GUARD,
     (
+        "estimation.joint.kernel",
+        "residuals",
+        "laid = _laid_rows(model, state, path, {}, 0)",
+        "0 → 1",
+    ): "residuals are of no parameter: how many there are is not looked at",
+    (
         "estimation.joint.covariance",
         "noise_of",
         "variance = float(np.mean(left[left != 0.0] ** 2)) if left.any() else 1.0",

@@ -51,7 +51,9 @@ def another_flight(information: pl.DataFrame) -> pl.DataFrame:
         [
             information,
             last.with_columns(
-                flight_id=pl.lit("new"), session_id=pl.lit("new"), started_at=pl.col("started_at") + dt.timedelta(days=7)
+                flight_id=pl.lit("new"),
+                session_id=pl.lit("new"),
+                started_at=pl.col("started_at") + dt.timedelta(days=7),
             ),
         ]
     )
