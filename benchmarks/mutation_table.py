@@ -2214,6 +2214,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "1e-300 → 1.1000000000000002e-300",
     ): _GUARD,
     ("estimation.wahba", "_quest_solution", "derivative = (4 * lam * lam - 2 * ab) * lam - c", "* → /"): _TURNED,
+    ("estimation.wahba", "_quest_solution", "derivative = (4 * lam * lam - 2 * ab) * lam - c", "* → / #2"): _TURNED,
     ("logs.ulog.parameters", "", "_DEGREES = 4", "4 → 5"): "there is no parameter of the next one, and 0 stands for it",
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""
