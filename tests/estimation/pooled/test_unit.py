@@ -73,10 +73,16 @@ def test_a_spoiled_flight_is_left_out(flight: int) -> None:
 
 
 def test_a_fifth_of_the_flights_may_be_left_out() -> None:
-    unit = drawn(np.random.default_rng(2), SESSIONS, seen=12)
+    unit = drawn(np.random.default_rng(2), 10, seen=12)
     assert {one.flight for one in pool(spoiled(spoiled(unit, 2), 8), KNOWN).left_out} == {2, 8}
     three = pool(spoiled(spoiled(spoiled(unit, 2), 5), 8), KNOWN)
     assert len(three.left_out) == 2
+
+
+@pytest.mark.parametrize(("sessions", "told"), [(2, False), (3, True)])
+def test_of_two_that_contradict_each_other_neither_is_left_out(sessions: int, told: bool) -> None:
+    unit = spoiled(drawn(np.random.default_rng(2), sessions, seen=40), 0)
+    assert [one.flight for one in pool(unit, KNOWN).left_out] == [0] * told
 
 
 def test_a_parallel_shift_of_the_reference_point_changes_nothing() -> None:
