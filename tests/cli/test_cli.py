@@ -177,6 +177,53 @@ def test_a_log_without_any_constant_is_told_with_the_motion_that_it_wanted(
     ]
 
 
+def test_every_table_fits_80_columns_and_breaks_no_number(
+    capsys: pytest.CaptureFixture[str], archive: Path, warehouse: Path, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(archive.parent)  # paths are long on their own account
+    at = ("--warehouse", "warehouse")
+    commands = [
+        ("calibrate", str(log)),
+        ("nightly", "archive", "--dry-run", *at),
+        ("nightly", "archive", *at),
+        ("history", *at),
+        ("drift", *at),
+        ("drift", "--sensor", "fit", *at),
+        ("sql", "SELECT * FROM latest_calibration", *at),
+        ("sql", "SELECT log_uri, reason FROM flight", *at),
+        ("refit", "--vehicle", "sim-1", *at),
+        ("schemas",),
+        ("schemas", "drift"),
+        ("doctor", "--archive", "archive", *at),
+        ("inspect", str(log.relative_to(archive.parent))),
+    ]
+    numbers = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")
+    for command in commands:
+        capsys.readouterr()
+        assert run(command) in (0, 3)
+        told = capsys.readouterr().out
+        assert told
+        long = [line for line in told.splitlines() if len(line) > 80]
+        assert [line for line in long if not line.startswith("fieldcal sql ")] == [], command  # to be copied
+        if "±" not in told or command[0] == "calibrate":
+            continue
+        run([*command, "--wide"])
+        wide = capsys.readouterr().out
+        for line in filter(lambda line: "±" in line, told.splitlines()):
+            assert all(number in wide for number in numbers.findall(line)), line
+
+
+def test_wide_shows_everything(capsys: pytest.CaptureFixture[str], warehouse: Path) -> None:
+    capsys.readouterr()
+    rows = document(capsys, "drift", "--json", "--warehouse", str(warehouse))
+    assert run(["drift", "--wide", "--warehouse", str(warehouse)]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert set(told[1].split()) == {*rows[0], "written"}
+    assert len([line for line in told if "sim-1" in line]) == len(rows)
+    run(["sql", "FROM calibration", "--warehouse", str(warehouse)])
+    assert "Not shown:" in capsys.readouterr().out
+
+
 def test_the_history_in_three_forms(capsys: pytest.CaptureFixture[str], warehouse: Path) -> None:
     asked = ["history", "--warehouse", str(warehouse), "--sensor", "gyroscope", "--parameter", "scale"]
     rows = document(capsys, *asked, "--json")
@@ -187,7 +234,7 @@ def test_the_history_in_three_forms(capsys: pytest.CaptureFixture[str], warehous
     assert [float(row["value"]) for row in listed] == [row["value"] for row in rows]
     assert document(capsys, *asked, "--json", "--since", "2026-02-01") == []
     assert run(asked) == 0
-    assert "gyroscope" in capsys.readouterr().out
+    assert "gyro x scale" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("command", ["history", "drift"])

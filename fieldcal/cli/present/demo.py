@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+from fieldcal.cli.present.constants import constant
 from fieldcal.cli.present.night import print_night
 from fieldcal.cli.present.progress import NightProgress
-from fieldcal.cli.show import console, table
+from fieldcal.cli.present.screen import Listing, console, table
 from fieldcal.flows.run import run_night
 from fieldcal.names import SENSORS, Status, exactness
 from fieldcal.schemas.rows import CalibrationRow
@@ -17,12 +18,9 @@ from fieldcal.simulation.archive import Truth, write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.stages.tables import AXES
 from fieldcal.warehouse import Warehouse
-from fieldcal.words.numbers import number, with_sd
+from fieldcal.words.measures import measure
 from fieldcal.words.rows import typed
 from fieldcal.words.talk import say
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 VEHICLES, SESSIONS, FLIGHTS = 2, 2, 1
 PARAMETERS: tuple[Literal["scale", "zero"], ...] = ("scale", "zero")
@@ -54,7 +52,7 @@ def run_demo(folder: Path, root: Path, config: Path | None) -> bool:
     return bool(result["ok"] != len(result["logs"]))
 
 
-def beside_truth(rows: Sequence[CalibrationRow], truth: Truth, uri: str) -> Table:
+def beside_truth(rows: Sequence[CalibrationRow], truth: Truth, uri: str) -> Listing:
     """Scale and zero of one flight, by the method that counts, with sd, the truth, and the error in sd and per cent."""
     counting = sorted((row for row in rows if row["status"] == Status.OK), key=lambda row: -exactness(row["method"]))
     found = {(row["sensor"], row["parameter"], row["axis"]): row for row in counting}
@@ -65,10 +63,11 @@ def beside_truth(rows: Sequence[CalibrationRow], truth: Truth, uri: str) -> Tabl
                 row = found.get((sensor, parameter, axis))
                 true = truth["constants"][sensor][parameter][i]
                 if row is not None and row["value"] is not None:
-                    value, sd = row["value"], row["sd"]
-                    found_and_true = (with_sd(value, sd), number(true, 6), *_error(value, sd, true))
-                    lines.append([sensor, row["method"], parameter, axis, *found_and_true])
-    columns = ["sensor", "method", "parameter", "axis", "found", "truth", "error %", "error in sd"]
+                    value, sd, unit = row["value"], row["sd"], row["unit"]
+                    name = constant(sensor, axis, parameter)
+                    found_and_true = measure(value, sd, unit), measure(true, None, unit), *_error(value, sd, true)
+                    lines.append([name, *found_and_true])
+    columns = ["constant", "found", "truth", "error %", "in sd"]
     return table(columns, lines, f"{uri} beside the truth of the simulation")
 
 

@@ -10,13 +10,13 @@ from rich.console import Console
 
 from fieldcal.batch.documents import LogEntry, NightDocument, PlanDocument, PlannedLog, UnreadEntry
 from fieldcal.batch.outcome import cause, verdict_counts
-from fieldcal.cli.show import table
+from fieldcal.cli.present.flight import agreement, tic_and_rms
+from fieldcal.cli.present.screen import table
 from fieldcal.logs.unread import Unread, told
 from fieldcal.names import Standing, Verdict
 from fieldcal.report.fitness import fleet_fitness, ranked, remembered_alerts
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.flights import is_consequence
-from fieldcal.words.numbers import number
 
 WORST = 5
 REFUSALS = 12
@@ -42,18 +42,17 @@ def print_night(console: Console, result: NightDocument, root: Path) -> None:
             console.print(f"  … and {len(refused) - REFUSALS} more: SELECT * FROM refusals", markup=False)
     worst = _worst(root, [log["flight_id"] for log in result["logs"]])
     if worst:
-        columns = ["log", "quantity", "method", "against", "TIC", "rms"]
+        columns = ["log", "agreement", "TIC", "rms"]
         console.print(table(columns, worst, "Poorest agreement (Theil inequality coefficient, smoothed)"))
     if result["changes"]:
         lines = [[change["kind"], change["sentence"]] for change in result["changes"]]
         console.print(table(["new", "what"], lines[:CHANGES], "What changed in the fleet"))
         if len(lines) > CHANGES:
             console.print(f"  … and {len(lines) - CHANGES} more: fieldcal drift", markup=False)
-    console.print(f"History: {root}/tables (fieldcal history, drift, sql)", markup=False)
-    console.print(f"Report:  {result['report']} (fieldcal report --vehicle V, --flight ID)", markup=False)
-    console.print(
-        f"Site:    {result['site']} (every vehicle and flight; any web server serves its folder)", markup=False
-    )
+    console.print()
+    console.print(f"Report: {result['report']}", markup=False)
+    console.print(f"Site:   {result['site']}", markup=False)
+    console.print("Ask:    fieldcal drift, history, sql, report --vehicle V, --flight ID", markup=False)
 
 
 def print_fleet(console: Console, root: Path) -> None:
@@ -118,4 +117,7 @@ def _worst(root: Path, flights: Sequence[str]) -> list[list[str]]:
         .head(WORST)
         .collect()
     )
-    return [[*row[:4], number(row[4], 3), f"{number(row[5], 3)} {row[6]}"] for row in rows.iter_rows()]
+    return [
+        [row["log_uri"], agreement(row), *tic_and_rms(row["tic"], row["rms"], row["rms_unit"])]
+        for row in rows.iter_rows(named=True)
+    ]
