@@ -9,7 +9,7 @@ from fieldcal.batch.documents import LogEntry, NightDocument
 from fieldcal.batch.outcome import verdict_counts
 from fieldcal.flows.connection import answers
 from fieldcal.names import Verdict
-from fieldcal.trends.changes import Change
+from fieldcal.report.standing.news import Change
 
 KEY = "fieldcal-night"
 MOST_ROWS = 500

@@ -8,7 +8,7 @@ from fieldcal.config.find import Source
 from fieldcal.flight.job import PlainJob
 from fieldcal.flight.record import Record, Refusal
 from fieldcal.logs.facts import FindingFacts
-from fieldcal.trends.changes import PlainChange
+from fieldcal.report.standing.news import PlainChange
 
 
 class PlainOutcome(TypedDict):

@@ -41,5 +41,7 @@ def drift(
     elif wide:
         print_frame(as_written(rows, "value_at_25degc"), as_json=False, as_csv=False, wide=True)
     else:
-        print_drift(console(), rows)
+        from fieldcal.report.standing.memory import following
+
+        print_drift(console(), rows, following(fieldcal.Warehouse(warehouse).root, rows["vehicle_id"].unique()))
     return 0

@@ -267,6 +267,25 @@ class Limits(Table):
     memory_mb: Annotated[Positive, _meaning("memory of its process beyond which it is ended", "MB")] = 8192.0
 
 
+class Tolerances(Table):
+    """By how much the constants that a vehicle flies with may be off before it is to be calibrated again. Results do
+    not depend on it; what is not given is not asked."""
+
+    gyroscope_degps: Annotated[Positive | None, _meaning("of a gyroscope's zero", "deg/s")] = None
+    accelerometer_mg: Annotated[Positive | None, _meaning("of an accelerometer's zero", "mg")] = None
+    magnetometer_ut: Annotated[Positive | None, _meaning("of a magnetometer's zero", "uT")] = None
+    heading_deg: Annotated[Positive | None, _meaning("of the heading by the magnetometer", "deg")] = None
+
+    @property
+    def given(self) -> bool:
+        """Whether there is any."""
+        return any(getattr(self, name) is not None for name in Tolerances.model_fields)
+
+
+class LimitsTable(Limits, Tolerances):
+    """`[limits]`: what one log may take of the machine in a night, and what a vehicle's constants may be off."""
+
+
 class Document(Table):
     """The whole of `fieldcal.toml`."""
 
@@ -276,7 +295,7 @@ class Document(Table):
     vehicles: Annotated[dict[str, VehicleTable], _meaning("by the vehicle's folder")] = {}
     archive: Archive = Archive()
     alerts: Alerts = Alerts()
-    limits: Limits = Limits()
+    limits: LimitsTable = LimitsTable()
 
 
 @dataclass(frozen=True)
@@ -304,7 +323,12 @@ class Configuration:
     @property
     def limits(self) -> Limits:
         """What one log may take of the machine."""
-        return self.document.limits
+        return Limits(**{name: getattr(self.document.limits, name) for name in Limits.model_fields})
+
+    @property
+    def tolerances(self) -> Tolerances:
+        """By how much constants may be off."""
+        return Tolerances(**{name: getattr(self.document.limits, name) for name in Tolerances.model_fields})
 
     def vehicle(self, vehicle_id: str) -> Vehicle:
         """What is configured for `vehicle_id`."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fieldcal.batch.documents import LogEntry, NightDocument
 from fieldcal.names import Verdict
-from fieldcal.trends.changes import KINDS
+from fieldcal.report.standing.reason import KINDS
 from fieldcal.words.printable import printable
 
 MOST_OF_VEHICLE, MOST_VEHICLES, MOST_LOGS = 4, 15, 15

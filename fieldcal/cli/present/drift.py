@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from fieldcal.cli.present.constants import constant, telling
@@ -9,18 +10,19 @@ from fieldcal.cli.present.history import titled
 from fieldcal.cli.present.screen import Screen, table
 from fieldcal.names import exactness
 from fieldcal.schemas.rows import DriftRow
+from fieldcal.trends.reasons import MONTH_D, status_words
 from fieldcal.words.measures import change, measure
 from fieldcal.words.rows import typed
 
 if TYPE_CHECKING:
     import polars as pl
 
-MONTH_D = 30.0
 COLUMNS = ("constant", "status", "value at 25 °C", "in 30 days")
 
 
-def print_drift(screen: Screen, frame: pl.DataFrame) -> None:
-    """Rows of `drift` that tell most; how many others there are is said."""
+def print_drift(screen: Screen, frame: pl.DataFrame, following: Mapping[str, str] | None) -> None:
+    """Rows of `drift` that tell most; how many others there are is said. `following`: when to calibrate each vehicle
+    again; None without limits."""
     rows = typed(frame.iter_rows(named=True), DriftRow)
     shown = telling(rows)
     units: dict[tuple[str, str], list[DriftRow]] = {}
@@ -34,6 +36,10 @@ def print_drift(screen: Screen, frame: pl.DataFrame) -> None:
         screen.print(table(COLUMNS, lines, titled(vehicle, unit, own), drop_silent=True))
         for reason, names in _reasons(own).items():
             screen.print(f"{names[0]}{f' (and {len(names) - 1} more)' if len(names) > 1 else ''}: {reason}")
+    for vehicle, told in (following or {}).items():
+        screen.print(f"{vehicle}: {told}")
+    if following is None and rows:
+        screen.print("When to calibrate again: nights tell it by [limits] of fieldcal.toml, which has none.")
     if hidden := len(rows) - len(shown):
         screen.print(f"Not shown: {hidden} steady rows: other methods, bias, zero, agreement (--wide).")
 
@@ -50,7 +56,7 @@ def _line(row: DriftRow, is_best: bool) -> list[str]:
     )
     return [
         name if is_best else f"{name} ({row['method'].replace('_', ' ')})",
-        row["status"],
+        status_words(row),
         measure(row["value_at_25degc"], row["sd"], row["unit"]),
         moved,
     ]

@@ -64,7 +64,7 @@ def name_of(vehicle: str, unit: str) -> str:
 
 def titled(vehicle: str, unit: str, rows: Sequence[DriftRow] | Sequence[PooledRow]) -> str:
     """A unit and the sessions that its rows are made of."""
-    counts = sorted({row["n_sessions"] for row in rows})
+    counts = sorted({row["n_sessions"] or 0 for row in rows})
     of = str(counts[0]) if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
     return f"{name_of(vehicle, unit)}: {of} session{'' if of == '1' else 's'}"
 

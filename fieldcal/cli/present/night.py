@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 
 from rich.console import Console
@@ -14,7 +13,8 @@ from fieldcal.cli.present.flight import agreement, tic_and_rms
 from fieldcal.cli.present.screen import table
 from fieldcal.logs.unread import Unread, told
 from fieldcal.names import Standing, Verdict
-from fieldcal.report.fitness import fleet_fitness, ranked, remembered_alerts
+from fieldcal.report.fitness import ranked
+from fieldcal.report.standing.memory import remembered_fleet
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.flights import is_consequence
 
@@ -56,8 +56,8 @@ def print_night(console: Console, result: NightDocument, root: Path) -> None:
 
 
 def print_fleet(console: Console, root: Path) -> None:
-    """Which vehicles are fine to fly, and of the others why not, the gravest first: as the site says it."""
-    fleet = fleet_fitness(Warehouse(root), remembered_alerts(root), datetime.now(UTC))
+    """Which vehicles are fine to fly, and of the others why not, the gravest first: what the night said of them."""
+    fleet = remembered_fleet(root)
     if not fleet:
         return
     fine = sum(one.standing == Standing.FINE for one in fleet.values())
@@ -68,6 +68,9 @@ def print_fleet(console: Console, root: Path) -> None:
         console.print(table(["vehicle", "standing", "why"], lines))
         if len(others) > VEHICLES:
             console.print(f"  … and {len(others) - VEHICLES} more: the site's first page", markup=False)
+    following = [[one.vehicle_id, one.next] for one in ranked(fleet) if one.next and one.next not in one.why(1)]
+    if following:
+        console.print(table(["vehicle", "next calibration"], following[:VEHICLES]))
 
 
 def _refusals(log: LogEntry) -> list[list[str]]:
