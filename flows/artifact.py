@@ -32,7 +32,7 @@ def keep_artifact(result: NightDocument, root: Path) -> None:
     told = (
         f"{len(result['logs'])} logs: {counts}. {result['stages_run']} stages run, {result['stages_cached']} from the "
         f"cache. History: `{root}/tables`. Report: `{result['report']}`."
-        f" Site: `{result['site']}`."
+        + (f" Site: `{result['site']}`." if result["site"] else "")
     )
     if len(rows) > MOST_ROWS:
         told += f" The first {MOST_ROWS} of {len(rows)} rows; all: `fieldcal sql 'SELECT * FROM refusals'`."

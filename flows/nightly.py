@@ -138,7 +138,7 @@ def carry_out(
         for publishing in publishings(night, outcomes):
             publish_as_task(publishing)
         night.remember(outcomes)
-        closing = close_night(night.root, Criteria.of(night.configuration))
+        closing = close_night(night.root, Criteria.of(night.configuration), with_site=night.configuration.writes_site)
         result = night.document(outcomes, closing)
         keep_artifact(result, night.root)
         tell_prefect(closing.changes)

@@ -36,7 +36,7 @@ class Closing:
     site: Path | None = None
 
 
-def close_night(root: Path, criteria: Criteria) -> Closing:
+def close_night(root: Path, criteria: Criteria, *, with_site: bool = True) -> Closing:
     """Bring trends and reports up to the history; what is to be told tonight that was not told before.
 
     Trends are regressed only where the history, or the code that makes them, is another than last time. The fleet is
@@ -73,7 +73,7 @@ def close_night(root: Path, criteria: Criteria) -> Closing:
         fleet = fleet_fitness(snapshot, criteria, now)
         told = news(fleet, remembered_fleet(root))
         report = _reports(root, told)
-        site = write_pages(snapshot, fleet)
+        site = write_pages(snapshot, fleet) if with_site else None
         made = history_digest(root, FLEET_TABLES)
         remember(root, fleet, criteria, {"made_from": made_from, "made": made})
         return Closing(told, report, site)

@@ -80,11 +80,12 @@ class UnreadEntry(TypedDict):
 
 
 class NightDocument(NightSummary):
-    """What `nightly --json` prints. `seconds` the whole duration, `server_seconds` what Prefect took of it."""
+    """What `nightly --json` prints. `site` None where `[site]` says that none is written; `seconds` the whole duration,
+    `server_seconds` what Prefect took of it."""
 
     changes: list[PlainChange]
     report: str
-    site: str
+    site: str | None
     unread: list[UnreadEntry]
     seconds: NotRequired[float]
     server_seconds: NotRequired[float]

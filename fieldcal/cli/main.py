@@ -317,6 +317,19 @@ def doctor(
     return OK if result.ok else FAILED
 
 
+@app.command
+def completion(shell: Literal["bash", "zsh", "fish"], /) -> int:
+    """Print what makes a shell complete commands, options and their values.
+
+    Parameters
+    ----------
+    shell
+        Whose: fieldcal completion bash > ~/.local/share/bash-completion/completions/fieldcal
+    """
+    print(app.generate_completion(shell=shell))
+    return OK
+
+
 def main(tokens: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
     from fieldcal.cli.present.characters import settle

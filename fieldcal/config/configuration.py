@@ -259,6 +259,14 @@ class Alerts(Table):
     )
 
 
+class Site(Table):
+    """The site of linked pages."""
+
+    write: Annotated[bool, _meaning("whether each night brings it up to the history; fieldcal site does so anyway")] = (
+        True
+    )
+
+
 class Limits(Table):
     """What one log may take of the machine in a night, reading and all stages together. Results do not depend on it."""
 
@@ -296,6 +304,7 @@ class Document(Table):
     archive: Archive = Archive()
     alerts: Alerts = Alerts()
     limits: LimitsTable = LimitsTable()
+    site: Site = Site()
 
 
 @dataclass(frozen=True)
@@ -319,6 +328,11 @@ class Configuration:
     def alerts(self) -> Alerts:
         """When the report warns."""
         return self.document.alerts
+
+    @property
+    def writes_site(self) -> bool:
+        """Whether each night writes the site."""
+        return self.document.site.write
 
     @property
     def limits(self) -> Limits:

@@ -94,6 +94,34 @@ def test_help_imports_nothing_heavy() -> None:
     assert told.stdout == "[]\n"
 
 
+COMPLETED = """
+source /dev/stdin
+asked() {
+  COMP_WORDS=(fieldcal "$@"); COMP_CWORD=$#; COMPREPLY=()
+  _fieldcal fieldcal "${COMP_WORDS[COMP_CWORD]}" "${COMP_WORDS[COMP_CWORD-1]}"
+  echo "${COMPREPLY[*]}"
+}
+asked nig; asked history --sens; asked drift --sensor gyro; asked alerts te; asked export v --format px
+"""
+
+
+def test_bash_completes_commands_options_and_their_values(capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    assert run(["completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    done = subprocess.run(["bash", "-c", COMPLETED], input=script, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["nightly", "--sensor", "gyroscope", "test", "px4"]
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells_are_completed_too(capsys: pytest.CaptureFixture[str], shell: str) -> None:
+    capsys.readouterr()
+    assert run(["completion", shell]) == 0
+    told = capsys.readouterr().out
+    assert "nightly" in told
+    assert "--sensor" in told or "-l sensor" in told
+
+
 def test_every_export_can_be_chosen() -> None:
     (documented,) = re.findall(r"to : \{(.*)\}", str(fieldcal.export.__doc__))
     assert get_args(Format) == tuple(FORMATS)

@@ -94,7 +94,8 @@ def test_trends_of_an_older_release_are_made_anew_and_those_of_a_newer_refused(t
 def test_limits_of_the_configuration_reach_the_night(tmp_path: Path) -> None:
     """Whoever shortens a limit is told at once of what that makes old, and once only; it is remembered for the site."""
     publish_fleet(tmp_path, units=1, sessions=3)
-    assert close_night(tmp_path, FAR).changes == []
+    quiet = close_night(tmp_path, FAR, with_site=False)
+    assert (quiet.changes, quiet.site, (tmp_path / "site").exists()) == ([], None, False)
     near = Criteria(Alerts(expires_days=1e5, idle_days=1e-3), Tolerances(gyroscope_degps=0.02))
     assert sorted({c.kind for c in close_night(tmp_path, near).changes}) == ["idle", "limit"]
     assert close_night(tmp_path, near).changes == []

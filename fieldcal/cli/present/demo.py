@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +15,7 @@ from fieldcal.cli.present.screen import Listing, console, table
 from fieldcal.flows.run import run_night
 from fieldcal.names import SENSORS, Status, exactness
 from fieldcal.schemas.rows import CalibrationRow
-from fieldcal.simulation.archive import Truth, write_flights
+from fieldcal.simulation.archive import DAYS_BETWEEN, FIRST_FLIGHT, Truth, write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.stages.tables import AXES
 from fieldcal.warehouse import Warehouse
@@ -35,7 +36,8 @@ def run_demo(folder: Path, root: Path, config: Path | None) -> bool:
     """Simulate, run the night, print. Whether any log is not `ok`."""
     archive = folder / "archive"
     say(f"Simulating {VEHICLES} vehicles, {SESSIONS} sessions each, in {archive} …")
-    logs = write_flights(archive, Experiment(), vehicles=VEHICLES, sessions=SESSIONS, flights=FLIGHTS)
+    first = first_flight(archive, datetime.now(UTC))
+    logs = write_flights(archive, Experiment(), vehicles=VEHICLES, sessions=SESSIONS, flights=FLIGHTS, first=first)
     say("Running the night (its first minute goes to Prefect's server) …")
     with NightProgress() as progress:
         result = run_night(archive.absolute(), root, config, None, 1, progress)
@@ -50,6 +52,14 @@ def run_demo(folder: Path, root: Path, config: Path | None) -> bool:
     for question in QUESTIONS:
         out.print(f'  fieldcal sql --warehouse {root} "{question}"', markup=False, soft_wrap=True)
     return bool(result["ok"] != len(result["logs"]))
+
+
+def first_flight(archive: Path, now: datetime) -> datetime:
+    """When the fleet flies first: so that its last session was yesterday; where it flew already, as it did."""
+    flown = sorted(archive.glob("*/????-??-??"))
+    yesterday = now.date() - timedelta(days=1 + DAYS_BETWEEN * (SESSIONS - 1))
+    day = date.fromisoformat(flown[0].name) if flown else yesterday
+    return datetime.combine(day, FIRST_FLIGHT.timetz())
 
 
 def beside_truth(rows: Sequence[CalibrationRow], truth: Truth, uri: str) -> Listing:

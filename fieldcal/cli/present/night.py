@@ -51,7 +51,8 @@ def print_night(console: Console, result: NightDocument, root: Path) -> None:
             console.print(f"  … and {len(lines) - CHANGES} more: fieldcal drift", markup=False)
     console.print()
     console.print(f"Report: {result['report']}", markup=False)
-    console.print(f"Site:   {result['site']}", markup=False)
+    if result["site"]:
+        console.print(f"Site:   {result['site']}", markup=False)
     console.print("Ask:    fieldcal drift, history, sql, report --vehicle V, --flight ID", markup=False)
 
 
