@@ -35,6 +35,8 @@ def print_flight(console: Console, document: FlightDocument, nominal: Nominal = 
     rows = document["calibration"]
     if rows:
         console.print(parameter_table(rows, nominal, wide=wide))
+        for code, names in _refused(rows).items():
+            console.print(f"refused: {', '.join(names)} ({code})", markup=False)
         if (logged := residual_table(rows, wide=wide)) is not None:
             console.print("The autopilot had corrected its readings; of those, as they are logged:", markup=False)
             console.print(logged)
@@ -95,6 +97,15 @@ def beside_table(rows: Sequence[CalibrationRow]) -> Listing | None:
         return None
     lines = [[row["sensor"], BESIDE[row["parameter"]], row["axis"], _value(row)] for row in found]
     return table(["sensor", "beside scale and zero", "axis", "value"], lines)
+
+
+def _refused(rows: Sequence[CalibrationRow]) -> dict[str, list[str]]:
+    """Scales that were refused, by the code of why."""
+    found: dict[str, list[str]] = {}
+    for row in counting(rows):
+        if row["status"] != Status.OK and row["parameter"] == "scale" and row["axis"] in AXES:
+            found.setdefault(str(row["reason_code"]), []).append(f"{row['sensor']} {row['axis']}")
+    return found
 
 
 def _off(scale: CalibrationRow | None, nominal: Sequence[float] | None, axis: int) -> str:
