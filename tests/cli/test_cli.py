@@ -6,6 +6,7 @@ import ast
 import csv
 import io
 import json
+import os
 import re
 import subprocess
 import sys
@@ -20,6 +21,8 @@ import fieldcal
 from fieldcal import schemas
 from fieldcal.cli.fly import Format
 from fieldcal.cli.main import run
+from fieldcal.cli.present.night import print_night
+from fieldcal.cli.present.screen import console
 from fieldcal.exports import FORMATS
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
@@ -148,7 +151,7 @@ def test_calibrate_shows_a_table_to_people(capsys: pytest.CaptureFixture[str], l
     capsys.readouterr()
     assert run(["calibrate", str(log)]) == 0
     told = capsys.readouterr().out
-    for word in ("ok", "magnetometer", "gyroscope", "±", "TIC", "VPS clock: lag"):
+    for word in ("ok", "mag x", "gyro x", "°/s/count", "±", "TIC", "VPS clock: lag"):
         assert word in told
 
 
@@ -174,6 +177,11 @@ def test_a_rejected_log_is_told_and_ends_in_3(capsys: pytest.CaptureFixture[str]
 
 def test_the_night_as_json(capsys: pytest.CaptureFixture[str], archive: Path, warehouse: Path) -> None:
     found = document(capsys, "nightly", str(archive), "--warehouse", str(warehouse), "--json", code=3)
+    print_night(console(), found, warehouse)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("3 logs: 1 ok, 1 no_result, 1 rejected; 0 stages run")
+    assert lines[1] == "Fleet: 0 of 2 vehicles fine to fly"
+    assert [line for line in lines if len(line) > 80 and not line.startswith(("Report:", "Site:"))] == []
     counts = {"ok", "partial", "no_result", "quarantined", "rejected"}
     assert set(found) - counts - {"stages_run", "stages_cached", "seconds", "logs", "unread"} == {
         "stage_seconds",
@@ -208,12 +216,11 @@ def test_a_log_without_any_constant_is_told_with_the_motion_that_it_wanted(
 def test_every_table_fits_80_columns_and_breaks_no_number(
     capsys: pytest.CaptureFixture[str], archive: Path, warehouse: Path, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(archive.parent)  # paths are long on their own account
-    at = ("--warehouse", "warehouse")
+    monkeypatch.chdir(warehouse.parent)  # paths are long on their own account
+    at, place = ("--warehouse", warehouse.name), os.path.relpath(archive)
     commands = [
         ("calibrate", str(log)),
-        ("nightly", "archive", "--dry-run", *at),
-        ("nightly", "archive", *at),
+        ("nightly", place, "--dry-run", *at),
         ("history", *at),
         ("drift", *at),
         ("drift", "--sensor", "fit", *at),
@@ -222,8 +229,8 @@ def test_every_table_fits_80_columns_and_breaks_no_number(
         ("refit", "--vehicle", "sim-1", *at),
         ("schemas",),
         ("schemas", "drift"),
-        ("doctor", "--archive", "archive", *at),
-        ("inspect", str(log.relative_to(archive.parent))),
+        ("doctor", "--archive", place, *at),
+        ("inspect", os.path.relpath(log)),
     ]
     numbers = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")
     for command in commands:
@@ -233,7 +240,7 @@ def test_every_table_fits_80_columns_and_breaks_no_number(
         assert told
         long = [line for line in told.splitlines() if len(line) > 80]
         assert [line for line in long if not line.startswith("fieldcal sql ")] == [], command  # to be copied
-        if "±" not in told or command[0] == "calibrate":
+        if "±" not in told or command[0] not in ("history", "drift"):
             continue
         run([*command, "--wide"])
         wide = capsys.readouterr().out

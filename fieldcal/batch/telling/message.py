@@ -49,7 +49,8 @@ def news_of(night: NightDocument, archive: Path, link: str | None = None) -> Mes
     lines = [*_vehicles(by_vehicle), *_logs(logs)]
     if good:
         lines += ["", "Fine again:", *_some([change["sentence"] for change in good], MOST_LOGS, "fieldcal drift")]
-    report = f"{link.rstrip('/')}/{Path(night['report']).name}" if link else night["report"]
+    path = Path(night["report"])
+    report = f"{link.rstrip('/')}/{path.name}" if link else path.absolute()
     lines += ["", f"Report: {report}"]
     return Message(_title(archive, by_vehicle, logs), _printed(lines))
 
@@ -73,7 +74,8 @@ def _title(archive: Path, by_vehicle: dict[str, list[str]], logs: Sequence[LogEn
         need = "needs" if len(names) == 1 else "need"
         return printable(f"fieldcal, {archive.name}: {some} {need} a look")
     if logs:
-        return printable(f"fieldcal, {archive.name}: {len(logs)} new logs are not fine")
+        what = "1 new log is" if len(logs) == 1 else f"{len(logs)} new logs are"
+        return printable(f"fieldcal, {archive.name}: {what} not fine")
     return printable(f"fieldcal, {archive.name}: fine again")
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
-from fieldcal.cli.present.constants import counting
+from fieldcal.cli.present.constants import constant, counting
 from fieldcal.cli.present.screen import Listing, table
 from fieldcal.names import RESIDUAL, Status, exactness
 from fieldcal.report.words import plain_name
@@ -44,7 +44,7 @@ def print_flight(console: Console, document: FlightDocument, nominal: Nominal = 
             console.print(beside)
         if not wide and (others := sorted({row["method"] for row in rows} - {row["method"] for row in counting(rows)})):
             console.print(f"Estimated besides by {', '.join(map(plain_name, others))} (--wide).", markup=False)
-    print_refusals(console, document["run"])
+    print_refusals(console, document["run"], wide=wide)
     for sentence in advised(document["run"]):
         console.print(sentence, markup=False)
     if document["fit"]:
@@ -73,7 +73,7 @@ def parameter_table(rows: Sequence[CalibrationRow], nominal: Nominal = NONE, *, 
             if wide:
                 lines.append([sensor, method, axis, *values, standing(first["status"], first["reason_code"])])
             else:
-                lines.append([f"{sensor} {axis}", *values, first["status"]])
+                lines.append([constant(sensor, axis, ""), *values, first["status"]])
     if wide:
         columns = ["sensor", "method", "axis", "scale", "off nominal", *parameters[1:], "status"]
         return table(columns, lines, drop_silent=True)
@@ -104,7 +104,7 @@ def _refused(rows: Sequence[CalibrationRow]) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for row in counting(rows):
         if row["status"] != Status.OK and row["parameter"] == "scale" and row["axis"] in AXES:
-            found.setdefault(str(row["reason_code"]), []).append(f"{row['sensor']} {row['axis']}")
+            found.setdefault(str(row["reason_code"]), []).append(constant(row["sensor"], row["axis"], ""))
     return found
 
 
@@ -119,8 +119,9 @@ def _value(row: CalibrationRow | None) -> str:
     return "–" if row is None else measure(row["value"], row["sd"], row["unit"])
 
 
-def print_refusals(console: Console, runs: Sequence[UnfoldedRun]) -> None:
-    """Stages that refused or failed: their sentence, and the numbers behind it. What follows from them is one line."""
+def print_refusals(console: Console, runs: Sequence[UnfoldedRun], *, wide: bool = False) -> None:
+    """Stages that refused or failed: their sentence, wide with the numbers behind it; what follows from them in a
+    line."""
     stopped = [run for run in runs if run["status"] in (Status.REFUSED, Status.FAILED) and run["stage"] != "ingest"]
     follow = [run["stage"] for run in stopped if is_consequence(run)]
     told: set[str] = set()
@@ -131,7 +132,7 @@ def print_refusals(console: Console, runs: Sequence[UnfoldedRun]) -> None:
         told.add(reason)
         numbers = {k: v for k, v in run["measured"].items() if k != "reason" and isinstance(v, int | float)}
         console.print(f"{run['status']} {run['stage']} ({run['reason_code']}): {reason}", markup=False)
-        if numbers:
+        if numbers and wide:
             console.print("    " + ", ".join(f"{k} = {cell(v)}" for k, v in numbers.items()), markup=False)
     if follow:
         console.print(f"not run for want of their input: {', '.join(follow)}", markup=False)

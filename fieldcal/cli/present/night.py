@@ -14,6 +14,7 @@ from fieldcal.logs.unread import Unread, told
 from fieldcal.names import Standing, Verdict
 from fieldcal.report.fitness import ranked
 from fieldcal.report.standing.memory import remembered_fleet
+from fieldcal.report.words import count
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.flights import is_consequence
 
@@ -26,7 +27,7 @@ VEHICLES = 15
 def print_night(console: Screen, result: NightDocument, root: Path) -> None:
     """The answer first: who is fine to fly, what changed; then logs that need a look, and what was refused and why."""
     work = f"{result['stages_run']} stages run, {result['stages_cached']} from the cache, {result['seconds']:.1f} s"
-    console.print(f"{len(result['logs'])} logs: {_verdicts(result)}; {work}")
+    console.print(f"{count(len(result['logs']), 'log')}: {_verdicts(result)}; {work}")
     print_unread(console, result["unread"])
     print_fleet(console, root)
     if result["changes"]:
