@@ -55,7 +55,8 @@ class Ledger:
             self._histories = cast(Mapping[str, str], found["histories"])
         except (OSError, BrokenSeal, KeyError):
             pass
-        self._common = _common()
+        self._common = _common(configuration)
+        self._vehicles: dict[str, str] = {}
         self._same_history: dict[str, bool] = {}
 
     def entry(self, job: Job) -> LogEntry | None:
@@ -63,7 +64,7 @@ class Ledger:
         known = self._flights.get(job.flight_id)
         if known is None or not self._history_is_same(job.vehicle_id):
             return None
-        if known["of"] != _of(job, self._configuration, self._common):
+        if known["of"] != self._of(job):
             return None
         return known["entry"] if _stamps(self._root, known["files"]) == known["as_they_were"] else None
 
@@ -91,8 +92,13 @@ class Ledger:
             return None
         files = sorted(_files(self._root, job, records))
         entry: LogEntry = {**outcome.entry(), "stages_run": 0, "stages_cached": len(records), "ran": {}}
-        of = _of(job, self._configuration, self._common)
-        return {"of": of, "files": files, "as_they_were": _stamps(self._root, files), "entry": entry}
+        return {"of": self._of(job), "files": files, "as_they_were": _stamps(self._root, files), "entry": entry}
+
+    def _of(self, job: Job) -> str:
+        """Digest of what a flight's results, and what is said of it, follow from."""
+        if (vehicle := self._vehicles.get(job.vehicle_id)) is None:
+            vehicle = self._vehicles[job.vehicle_id] = self._configuration.vehicle(job.vehicle_id).model_dump_json()
+        return _digest([job.plain(), vehicle, self._common])
 
     def _history_is_same(self, vehicle_id: str) -> bool:
         if vehicle_id not in self._same_history:
@@ -101,15 +107,12 @@ class Ledger:
         return self._same_history[vehicle_id]
 
 
-def _common() -> str:
+def _common(configuration: Configuration) -> str:
     """Digest of what every flight's results follow from."""
-    return json.dumps([dict(sources()), versions(), library_versions()], sort_keys=True)
+    return _digest([dict(sources()), versions(), library_versions(), configuration.limits.model_dump_json()])
 
 
-def _of(job: Job, configuration: Configuration, common: str) -> str:
-    """Digest of what a flight's results, and what is said of it, follow from."""
-    vehicle, limits = configuration.vehicle(job.vehicle_id), configuration.limits
-    parts = (job.plain(), vehicle.model_dump_json(), limits.model_dump_json(), common)
+def _digest(parts: object) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 

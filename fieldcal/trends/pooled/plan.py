@@ -31,7 +31,7 @@ from fieldcal.stages.composition import ORIGIN
 from fieldcal.stages.tables import AXES
 from fieldcal.trends.pooled.rows import limit_of, words_of
 from fieldcal.trends.pooled.table import information_that_counts, near
-from fieldcal.trends.pooled.units import HistoryUnit, units_of_history
+from fieldcal.trends.pooled.units import HistoryUnit, by_unit, unit_of
 from fieldcal.warehouse.questions import existing, known_vehicle
 
 SECONDS, TURN_RAD = 30.0, np.pi / 3
@@ -108,7 +108,7 @@ def plan(root: Path, vehicle_id: str) -> Plan:
         )
     now = table.sort("started_at", "flight_id", nulls_last=False)["pooled_with"][-1]
     rows = information_that_counts(root).filter(pl.col("unit_id") == now)
-    (one,) = units_of_history(rows)
+    one = unit_of(by_unit(rows)[0])
     with one_thread():
         found = near(one, _kinds(table.filter(pl.col("pooled_with") == now), one))
         axes = _axes(warehouse.scan("run", vehicle_id=vehicle_id))

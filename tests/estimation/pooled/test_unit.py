@@ -148,3 +148,15 @@ def test_units_without_a_fault_are_told_of_none() -> None:
     """A thinned run of `benchmarks/pooled.py alarms`."""
     ((wrong, _, hits),) = alarms(1, counts=(8,)).values()
     assert (wrong, hits) == (0, 1)
+
+
+def test_strengths_are_told_apart_by_a_quarter() -> None:
+    """Nothing stays nothing; a thousandth more is the same; a half more is not."""
+    coarse = Strengths(0.0, 3e-7, 2e-3, 1084.0).coarse()
+    assert coarse.walk == 0.0
+    assert coarse.scatter == pytest.approx(3e-7, rel=0.12)
+    assert coarse.slope == pytest.approx(2e-3, rel=0.12)
+    assert coarse.freedom == round(1.25**31)
+    assert Strengths(0.0, 3.003e-7, 2.002e-3, 1085.0).coarse() == coarse
+    assert Strengths(0.0, 4.5e-7, 2e-3, 1084.0).coarse().scatter > 1.2 * coarse.scatter
+    assert coarse.coarse() == coarse
