@@ -154,7 +154,7 @@ def test_dates_and_sessions_follow_the_limits(young: Path) -> None:
     assert (narrow.standing, wide.standing) == (Standing.FINE, Standing.FINE)
     overdue = fitness(dt.datetime(2036, 1, 1, tzinfo=dt.UTC), gyroscope_degps=0.3)
     assert overdue.standing == Standing.LOOK
-    assert "may be off by 0.3 °/s since it was found last" in overdue.reasons[0]
+    assert "may be 0.3 °/s off what was found last" in overdue.reasons[0]
     unknown = fitness(last, gyroscope_degps=0.001)
     assert "more sessions would tell" in unknown.reasons[0]
 
@@ -178,5 +178,5 @@ def test_what_moved_since_it_was_exported_is_told(tmp_path: Path) -> None:
     criteria = Criteria(FAR.alerts, Tolerances(gyroscope_degps=0.25))
     one = fleet_fitness(Warehouse(tmp_path), criteria, START + dt.timedelta(days=170), ["v00"])["v00"]
     (moved,) = [reason for reason in one.told if reason.kind == "limit"]
-    assert "gyroscope x moved by" in moved.sentence
-    assert f"since it was exported on {START + dt.timedelta(days=50):%Y-%m-%d}; the limit is 0.25 °/s" in moved.sentence
+    assert "gyroscope x is 0.5" in moved.sentence
+    assert f"off what was exported on {START + dt.timedelta(days=50):%Y-%m-%d}; the limit is 0.25 °/s" in moved.sentence

@@ -131,7 +131,7 @@ def _due(row: DriftRow, limit: float, flown: Flown, now: datetime) -> Due:
         return Due(*place, now, more, True, told)
     off, since = _off(row, flown)
     if abs(off) > limit:
-        told = f"{about} moved by {measure(off, sd, row['unit'])} since it {since}; the limit is {allowed}."
+        told = f"{about} is {measure(off, sd, row['unit'])} off what {since}; the limit is {allowed}."
         return Due(*place, now, 0, True, told)
     slope, slope_sd = row["slope_per_day"], row["slope_per_day_sd"]
     if slope is None or slope_sd is None or row["as_of"] is None:
@@ -144,7 +144,8 @@ def _due(row: DriftRow, limit: float, flown: Flown, now: datetime) -> Due:
         return Due(*place, None, 0, False, f"{about} stays within {allowed} for ten years.")
     at = row["as_of"] + timedelta(days=float(days[passing[0]]))
     moves = measure(MONTH_D * slope, MONTH_D * slope_sd, row["unit"])
-    told = f"{about} moves by {moves} in 30 days: from then on it may be off by {allowed} since it {since}."
+    open_yet = ", which more sessions would narrow" if abs(slope) < SURE_SD * slope_sd else ""
+    told = f"{about} moves by {moves} in 30 days{open_yet}: from then on it may be {allowed} off what {since}."
     return Due(*place, at, 0, at <= now, told)
 
 
