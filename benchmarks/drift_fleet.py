@@ -5,6 +5,7 @@ spoiled by a magnet. Every unit has temperature coefficients of its own.
 
     python benchmarks/drift_fleet.py                    many fleets as rows of the history: seconds
     python benchmarks/drift_fleet.py --sessions 8       the same of young fleets: what so few sessions tell
+    python benchmarks/drift_fleet.py --sessions 18 --tell        when a drift is named, and was said to be
     python benchmarks/drift_fleet.py --logs FOLDER      one fleet as simulated logs through `fieldcal nightly`: minutes
 """
 
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import datetime as dt
 import json
+import re
 import subprocess
 import sys
 import time
@@ -274,6 +276,33 @@ def as_rows(seeds: int, first: int, understated: float) -> None:
     print(f"  {'CPU per IMU':32s} {1e3 * seconds / seeds / UNITS:.1f} ms")
 
 
+def late_by(seed: int, first: int, last: int) -> list[int]:
+    """How many sessions later than a stable row's `reason` said the drifting unit was named, each time that it said
+    something, from its first sessions on."""
+    flights = rows_of_history(draw(seed), seed)
+    said: dict[int, int] = {}
+    for n in range(first, last + 1):
+        table = table_of(flights.filter(pl.col("session_id") < f"s{n:02d}"))
+        unit = f"unit-{DRIFTING_UNIT:02d}"
+        place = {"sensor": "gyroscope", "parameter": "zero_bias", "method": "output_error", "axis": "y"}
+        row = table.row(by_predicate=pl.all_horizontal(pl.col("unit_id") == unit, *_same(place)), named=True)
+        if row["status"] == "drifting":
+            return [n - at - more for at, more in said.items()]
+        if (told := re.search(r"May drift.* about (\d+) more", row["reason"] or "")) is not None:
+            said[n] = int(told[1])
+    return []
+
+
+def _same(place: dict[str, str]) -> list[pl.Expr]:
+    return [pl.col(name) == value for name, value in place.items()]
+
+
+def as_told(seeds: int, first_seed: int) -> None:
+    late = np.array([by for seed in range(first_seed, first_seed + seeds) for by in late_by(seed, 7, SESSIONS)])
+    print(f"{len(late)} sentences on how many more sessions would tell, {seeds} fleets: the drift was named later by")
+    print(f"  median {np.median(late):.0f}, 10 to 90 % {np.percentile(late, 10):.0f} to {np.percentile(late, 90):.0f}")
+
+
 def as_logs(folder: Path, seed: int, duration_s: float, workers: int) -> None:
     archive, root = folder / "archive", folder / "warehouse"
     fleet = draw(seed)
@@ -303,6 +332,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=100, help="fleets that are rows")
     parser.add_argument("--first-seed", type=int, default=0, help="of the fleets that are rows")
     parser.add_argument("--sessions", type=int, help="of a unit, without spoiled flights; else 24 with them")
+    parser.add_argument("--tell", action="store_true", help="how many more sessions would tell, and did")
     parser.add_argument("--understated", type=float, default=1.0, help="equation error states its sd so much too small")
     parser.add_argument("--logs", type=Path, help="one fleet as logs, in this folder")
     parser.add_argument("--seed", type=int, default=0)
@@ -311,7 +341,9 @@ def main() -> None:
     options = parser.parse_args()
     if options.sessions is not None:
         of_sessions(options.sessions)
-    if options.logs is None:
+    if options.tell:
+        as_told(options.seeds, options.first_seed)
+    elif options.logs is None:
         as_rows(options.seeds, options.first_seed, options.understated)
     else:
         as_logs(options.logs, options.seed, options.duration, options.workers)

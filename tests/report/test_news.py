@@ -129,6 +129,8 @@ def test_a_young_fleet_is_told_what_so_few_sessions_tell_in_every_place_alike(
     assert {v for v, one in fitness.items() if one.standing != Standing.FINE} == {"v00"}
     (reason,) = fitness["v00"].reasons
     assert change.sentence == f"v00, imu-00: {reason}"
+    for path in (young / "reports" / "fleet.html", young / "reports" / "vehicle-v00.html"):
+        assert '<span class="badge look">drift or step</span>' in path.read_text()
     page = (young / "site" / "vehicle-v00.html").read_text()
     assert reason in page
     assert reason in (young / "site" / "index.html").read_text()
