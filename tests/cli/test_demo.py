@@ -78,6 +78,6 @@ def test_a_refused_constant_is_left_out(flight: tuple[list[CalibrationRow], Trut
 
 def test_the_fleet_flew_yesterday_and_when_it_flies_again_as_it_did(tmp_path: Path) -> None:
     now = dt.datetime(2026, 11, 30, 1, 0, tzinfo=dt.UTC)
-    assert first_flight(tmp_path, now) == dt.datetime(2026, 11, 22, 8, 0, tzinfo=dt.UTC)
+    assert first_flight(tmp_path, now) == dt.datetime(2026, 11, 1, 8, 0, tzinfo=dt.UTC)
     (tmp_path / "sim-1" / "2026-11-02").mkdir(parents=True)
     assert first_flight(tmp_path, now) == dt.datetime(2026, 11, 2, 8, 0, tzinfo=dt.UTC)
