@@ -1499,6 +1499,36 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "1e-300 → 1.1000000000000002e-300",
     ): _GUARD,
     (
+        "estimation.gravity_seen",
+        "gravity_removed",
+        "if LEAST_MEAN <= mean <= 1 / LEAST_MEAN or LEAST_TURNING <= turning <= 1 / LEAST_TURNING:",
+        "<= → <",
+    ): _NEVER_MET,
+    (
+        "estimation.gravity_seen",
+        "gravity_removed",
+        "if LEAST_MEAN <= mean <= 1 / LEAST_MEAN or LEAST_TURNING <= turning <= 1 / LEAST_TURNING:",
+        "<= → < #2",
+    ): _NEVER_MET,
+    (
+        "estimation.gravity_seen",
+        "gravity_removed",
+        "if LEAST_MEAN <= mean <= 1 / LEAST_MEAN or LEAST_TURNING <= turning <= 1 / LEAST_TURNING:",
+        "<= → < #3",
+    ): _NEVER_MET,
+    (
+        "estimation.gravity_seen",
+        "gravity_removed",
+        "if LEAST_MEAN <= mean <= 1 / LEAST_MEAN or LEAST_TURNING <= turning <= 1 / LEAST_TURNING:",
+        "<= → < #4",
+    ): _NEVER_MET,
+    (
+        "estimation.pooled.unit",
+        "_worst_flight",
+        "if len(sessions) < FEWEST_TO_CONTRADICT or len(out) + 1 > max(1.0, LARGEST_LEFT_OUT * len(flights)):",
+        "1.0 → 1.1",
+    ): "counts are whole",
+    (
         "estimation.joint.kernel",
         "residuals",
         "laid = _laid_rows(model, state, path, {}, 0)",
@@ -2214,6 +2244,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "1e-300 → 1.1000000000000002e-300",
     ): _GUARD,
     ("estimation.wahba", "_quest_solution", "derivative = (4 * lam * lam - 2 * ab) * lam - c", "* → /"): _TURNED,
+    ("estimation.wahba", "_quest_solution", "derivative = (4 * lam * lam - 2 * ab) * lam - c", "* → / #2"): _TURNED,
     ("logs.ulog.parameters", "", "_DEGREES = 4", "4 → 5"): "there is no parameter of the next one, and 0 stands for it",
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

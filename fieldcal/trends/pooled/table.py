@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
@@ -15,8 +16,8 @@ from fieldcal.flight.threads import one_thread
 from fieldcal.provenance.run_key import run_key, source_digest
 from fieldcal.schemas import TABLES, table_key
 from fieldcal.trends.pooled.memory import Memory
-from fieldcal.trends.pooled.rows import rows_of_unit
-from fieldcal.trends.pooled.units import HistoryUnit, by_unit, sessions_flown, unit_of
+from fieldcal.trends.pooled.rows import rows_of_unit, strengths_told
+from fieldcal.trends.pooled.units import DAY, EPOCH, HistoryUnit, by_unit, sessions_flown, unit_of
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.decisions.withdrawn import counting
 from fieldcal.warehouse.layout import history_files
@@ -79,6 +80,24 @@ def table_of(information: pl.DataFrame, memory: Memory | None = None) -> pl.Data
         .sort(KEY)
         .select(TABLES["pooled"].column_names)
     )
+
+
+def table_then(root: Path, table: pl.DataFrame, moment: datetime) -> pl.DataFrame:
+    """What rows of the table `pooled` were at another moment, by all flights before and after it; nothing is written.
+
+    Rows of units that no flight of which has a date are left out: nobody knows what they were when."""
+    day = ((moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - EPOCH) / DAY
+    information = information_that_counts(root)
+    out = [empty_frame("pooled")]
+    for (unit_id,), own in table.group_by("pooled_with", maintain_order=True):
+        one = unit_of(by_unit(information.filter(pl.col("unit_id") == unit_id))[0])
+        if one.last["started_at"] is None:
+            continue
+        kinds = strengths_told(own, one)
+        with one_thread():
+            rows = pl.DataFrame(rows_of_unit(one, near(one, kinds), kinds, day), schema=out[0].schema)
+        out.append(rows.join(own.select(KEY), on=KEY, how="semi"))
+    return pl.concat(out).sort(KEY)
 
 
 def kinds_of(units: Sequence[pl.DataFrame]) -> Kinds:
