@@ -28,6 +28,7 @@ from fieldcal.flows.tasks import publish_as_task, run_batch
 from fieldcal.names import Status
 from fieldcal.provenance.run_key import code_digest
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.report.fitness import Criteria
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.words.printable import printable
 from fieldcal.words.talk import say
@@ -137,7 +138,7 @@ def carry_out(
         for publishing in publishings(night, outcomes):
             publish_as_task(publishing)
         night.remember(outcomes)
-        closing = close_night(night.root, night.configuration.alerts)
+        closing = close_night(night.root, Criteria.of(night.configuration), with_site=night.configuration.writes_site)
         result = night.document(outcomes, closing)
         keep_artifact(result, night.root)
         tell_prefect(closing.changes)

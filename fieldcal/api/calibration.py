@@ -287,6 +287,18 @@ class Calibration:
             refused=own.reason,
         )
 
+    @property
+    def nominal_scale(self) -> dict[str, tuple[float, float, float]]:
+        """Scale of each sensor's data sheet, by axis, where it is known: 1 where the log is in physical units.
+
+        Examples
+        --------
+        >>> fieldcal.calibrate(log).nominal_scale  # doctest: +SKIP
+        {'accelerometer': (1.0, 1.0, 1.0), 'gyroscope': (1.0, 1.0, 1.0)}
+        """
+        known = {} if self._log.settings is None else self._log.settings.nominal_scale
+        return {str(sensor): own for sensor, own in known.items() if own is not None}
+
     def _rates(self) -> Rates | None:
         """Calibrated gyroscope in body axes, refused or not; None without numbers."""
         own = self.gyroscope

@@ -66,7 +66,7 @@ class Night:
             summary(outcomes, self.plan.done.values(), self.plan.copies, self.plan.copied, self.root)
         )
         unread = [asdict(one) for one in self.plan.unread]
-        pages = {"report": str(closing.report), "site": str(closing.site)}
+        pages = {"report": str(closing.report), "site": None if closing.site is None else str(closing.site)}
         return cast(NightDocument, {**told, "changes": changes, **pages, "unread": unread})
 
 

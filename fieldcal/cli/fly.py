@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 import fieldcal
-from fieldcal.cli.options import AsJson, Config, Output, Root, UnusedConfig, Whole
+from fieldcal.cli.options import AsJson, Config, Output, Root, UnusedConfig, Whole, Wide
 from fieldcal.reason_codes import ReasonCode
 
 Format = Literal["px4", "ardupilot", "ros", "imu_calib", "imu_pipeline", "kalibr", "json", "c"]
@@ -86,6 +86,7 @@ def compare(
     params: Path | None = None,
     logged_raw: bool = False,
     at_temperature: float | None = None,
+    wide: Wide = False,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: UnusedConfig = None,
@@ -107,8 +108,9 @@ def compare(
     from dataclasses import asdict
 
     from fieldcal.api.constants import comparison
-    from fieldcal.cli.show import console, print_json, table
-    from fieldcal.exports.autopilots.comparison import COLUMNS, lines
+    from fieldcal.cli.present.compared import print_compared
+    from fieldcal.cli.present.screen import console
+    from fieldcal.cli.show import print_json
     from fieldcal.words.talk import say
 
     root = fieldcal.Warehouse(warehouse)
@@ -120,13 +122,14 @@ def compare(
         as_told = [(row, {k: None if v != v else v for k, v in asdict(row).items()}) for row in rows]
         print_json([{**cells, "exported": of.get((row.unit_id, row.sensor))} for row, cells in as_told])
         return 0
-    console().print(table(COLUMNS, lines(rows), title=f"{vehicle}: what it flies with, and what is estimated"))
+    screen = console(wide=wide)
+    print_compared(screen, rows, vehicle)
     for sentence in told:
         say(sentence)
     if none := sorted({row.sensor for row in rows if row.parameter == "zero" and row.estimate != row.estimate}):
-        print(f'Not estimated: {", ".join(none)}; `fieldcal sql "FROM refusals"` says why.')
+        screen.print(f'Not estimated: {", ".join(none)}; `fieldcal sql "FROM refusals"` says why.')
     for one in exports:
-        print(one.sentence)
+        screen.print(one.sentence)
     return 0
 
 

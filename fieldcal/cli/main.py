@@ -18,7 +18,7 @@ from fieldcal.cli.fly import apply, compare, export
 from fieldcal.cli.interrupt import interruptible
 from fieldcal.cli.look import init, inspect
 from fieldcal.cli.onboard import onboard, refit
-from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
+from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Wide, Workers
 from fieldcal.cli.pooled import plan, pooled
 from fieldcal.cli.report import report as report_command
 from fieldcal.cli.report import site
@@ -77,6 +77,7 @@ def calibrate(
     unit: str = "imu",
     set_: Annotated[list[str] | None, Parameter(name="--set")] = None,
     report: Annotated[Path | None, Parameter(help="Write the flight's report to this HTML file too.")] = None,
+    wide: Wide = False,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -98,7 +99,7 @@ def calibrate(
     set_
         Overrule a stage parameter: --set smoothing_cutoff_hz=6.
     """
-    from fieldcal.cli.show import console, print_json
+    from fieldcal.cli.show import print_json
     from fieldcal.words.talk import say
 
     changes = _assignments(set_ or [])
@@ -111,8 +112,9 @@ def calibrate(
         print_json(result.document)
     else:
         from fieldcal.cli.present.flight import print_flight
+        from fieldcal.cli.present.screen import console
 
-        print_flight(console(), result.document)
+        print_flight(console(wide=wide), result.document, result.nominal_scale, wide=wide)
     return OK if result.verdict == Verdict.OK else LOSSES
 
 
@@ -125,6 +127,7 @@ def nightly(
     runner: Runner = "process",
     scheduler: Scheduler = None,
     dry_run: DryRun = False,
+    wide: Wide = False,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -138,7 +141,7 @@ def nightly(
     """
     _need_folder(archive, ReasonCode.NO_ARCHIVE, "archive")
     where = {"runner": runner, "scheduler": scheduler}
-    return _night(archive.absolute(), None, workers, where, dry_run, as_json, warehouse, config)
+    return _night(archive.absolute(), None, workers, where, (dry_run, as_json, wide), warehouse, config)
 
 
 @app.command
@@ -150,6 +153,7 @@ def session(
     runner: Runner = "process",
     scheduler: Scheduler = None,
     dry_run: DryRun = False,
+    wide: Wide = False,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -164,7 +168,7 @@ def session(
     _need_folder(folder, ReasonCode.NO_SESSION, "session folder")
     own = folder.absolute()
     where = {"runner": runner, "scheduler": scheduler}
-    return _night(own.parent.parent, own, workers, where, dry_run, as_json, warehouse, config)
+    return _night(own.parent.parent, own, workers, where, (dry_run, as_json, wide), warehouse, config)
 
 
 @app.command
@@ -174,6 +178,7 @@ def history(
     sensor: Literal["magnetometer", "accelerometer", "gyroscope"] | None = None,
     parameter: str | None = None,
     since: str | None = None,
+    wide: Wide = False,
     as_json: AsJson = False,
     as_csv: AsCsv = False,
     warehouse: Root = None,
@@ -190,19 +195,28 @@ def history(
     since
         Only flights that started then or later: 2026-05-04 or 2026-05-04T12:00.
     """
+    from fieldcal.cli.present.history import as_written, print_history
+    from fieldcal.cli.present.screen import console
     from fieldcal.cli.show import print_frame
 
     rows = fieldcal.Warehouse(warehouse).history(vehicle=vehicle, sensor=sensor, parameter=parameter, since=since)
-    whole = as_json or as_csv
-    usual = [("unit_id", rows["unit_id"].equals(rows["imu_id"])), ("dated_by", (rows["dated_by"] == "log").all())]
-    hidden = ["imu_id", "session_id", "flight_id", *(name for name, is_usual in usual if is_usual)]
-    print_frame(rows if whole else rows.drop(hidden), as_json=as_json, as_csv=as_csv)
+    if wide or as_json or as_csv:
+        print_frame(as_written(rows) if not (as_json or as_csv) else rows, as_json=as_json, as_csv=as_csv, wide=True)
+    else:
+        print_history(console(), rows)
     return OK
 
 
 @app.command
 def sql(
-    query: str, /, *, as_json: AsJson = False, as_csv: AsCsv = False, warehouse: Root = None, config: Config = None
+    query: str,
+    /,
+    *,
+    wide: Wide = False,
+    as_json: AsJson = False,
+    as_csv: AsCsv = False,
+    warehouse: Root = None,
+    config: Config = None,
 ) -> int:
     """Answer one SELECT over the tables and views; it can only read.
 
@@ -213,7 +227,7 @@ def sql(
     """
     from fieldcal.cli.show import print_frame
 
-    print_frame(fieldcal.Warehouse(warehouse).sql(query), as_json=as_json, as_csv=as_csv)
+    print_frame(fieldcal.Warehouse(warehouse).sql(query), as_json=as_json, as_csv=as_csv, wide=wide)
     return OK
 
 
@@ -291,21 +305,36 @@ def doctor(
     """
     from dataclasses import asdict
 
-    from fieldcal.cli.doctor import examine
+    from fieldcal.cli.doctor import examine, lines
     from fieldcal.cli.show import print_json
 
     result = examine(_root(warehouse), archive, config)
     if as_json:
         print_json(asdict(result))
     else:
-        for check in result.checks:
-            advice = f"\n{'':23}{check.advice}" if check.advice else ""
-            print(printable(f"{check.status:8} {check.check:14}{check.found}{advice}"))
+        for line in lines(result):
+            print(printable(line))
     return OK if result.ok else FAILED
+
+
+@app.command
+def completion(shell: Literal["bash", "zsh", "fish"], /) -> int:
+    """Print what makes a shell complete commands, options and their values.
+
+    Parameters
+    ----------
+    shell
+        Whose: fieldcal completion bash > ~/.local/share/bash-completion/completions/fieldcal
+    """
+    print(app.generate_completion(shell=shell))
+    return OK
 
 
 def main(tokens: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
+    from fieldcal.cli.present.characters import settle
+
+    settle(sys.stdout)
     # Processes started from here must not take what lies in the current folder for a module.
     os.environ.setdefault("PYTHONSAFEPATH", "1")
     sys.exit(run(sys.argv[1:] if tokens is None else tokens))
@@ -355,15 +384,15 @@ def _night(
     folder: Path | None,
     workers: int,
     where: dict[str, str | None],
-    dry: bool,
-    as_json: bool,
+    how: tuple[bool, bool, bool],
     warehouse: Path | None,
     config: Path | None,
 ) -> int:
-    from fieldcal.cli.show import console, print_json
+    from fieldcal.cli.show import print_json
     from fieldcal.flows.run import dry_run as plan_only
     from fieldcal.flows.run import run_night
 
+    dry, as_json, wide = how
     if workers < 1:
         raise _usage(ReasonCode.WRONG_OPTION, "--workers must be 1 or more.")
     root = _root(warehouse)
@@ -373,8 +402,9 @@ def _night(
             print_json(plan)
         else:
             from fieldcal.cli.present.night import print_plan
+            from fieldcal.cli.present.screen import console
 
-            print_plan(console(), plan)
+            print_plan(console(wide=wide), plan)
         return OK
     from fieldcal.cli.present.progress import NightProgress
 
@@ -384,8 +414,9 @@ def _night(
         print_json(result)
     else:
         from fieldcal.cli.present.night import print_night
+        from fieldcal.cli.present.screen import console
 
-        print_night(console(), result, root)
+        print_night(console(wide=wide), result, root)
     return OK if result["ok"] == len(result["logs"]) else LOSSES
 
 

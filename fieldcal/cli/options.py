@@ -28,6 +28,7 @@ Root = Annotated[
 UnusedRoot = Annotated[Path | None, Parameter(show=False)]
 AsJson = Annotated[bool, Parameter(name="--json", negative="", help="One JSON document on stdout.")]
 AsCsv = Annotated[bool, Parameter(name="--csv", negative="", help="CSV on stdout.")]
+Wide = Annotated[bool, Parameter(name="--wide", negative="", help="All rows and columns, as wide as they are.")]
 DryRun = Annotated[bool, Parameter(help="List what would run; change nothing.")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 SessionFolder = Annotated[Path, Parameter(name="SESSION_DIR")]

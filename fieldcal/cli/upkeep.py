@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import fieldcal
-from fieldcal.cli.options import AsJson, Root, UnusedConfig
+from fieldcal.cli.options import AsJson, Root, UnusedConfig, Wide
 from fieldcal.reason_codes import ReasonCode
 
 
@@ -71,7 +71,7 @@ def prune(
     return 0
 
 
-def schemas(name: str | None = None, /, *, as_json: AsJson = False, markdown: bool = False) -> int:
+def schemas(name: str | None = None, /, *, wide: Wide = False, as_json: AsJson = False, markdown: bool = False) -> int:
     """The tables and views that can be asked: columns with type, unit and meaning.
 
     Parameters
@@ -81,7 +81,8 @@ def schemas(name: str | None = None, /, *, as_json: AsJson = False, markdown: bo
     markdown
         As Markdown, whole.
     """
-    from fieldcal.cli.show import console, print_json, table
+    from fieldcal.cli.present.screen import console, table
+    from fieldcal.cli.show import print_json
     from fieldcal.warehouse.questions import nearest
     from fieldcal.warehouse.reference import markdown as as_markdown
     from fieldcal.warehouse.reference import relations
@@ -99,13 +100,13 @@ def schemas(name: str | None = None, /, *, as_json: AsJson = False, markdown: bo
         lines = [
             [one.name, one.kind, one.meaning.partition(". ")[0].partition(": ")[0].removesuffix(".")] for one in asked
         ]
-        console().print(table(["name", "kind", "what"], lines))
+        console(wide=wide).print(table(["name", "kind", "what"], lines))
         print("fieldcal schemas NAME: its columns.")
     else:
         (one,) = asked
-        console().print(f"{one.name} ({one.kind}): {one.meaning}", markup=False)
+        console(wide=wide).print(f"{one.name} ({one.kind}): {one.meaning}", markup=False)
         lines = [[f"{c.name} *" if c.key else c.name, c.type, c.unit, c.meaning] for c in one.columns]
-        console().print(table(["column", "type", "unit", "meaning"], lines))
+        console(wide=wide).print(table(["column", "type", "unit", "meaning"], lines))
         if one.example:
             print(f'fieldcal sql "{one.example}"')
     return 0

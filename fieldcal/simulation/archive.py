@@ -22,6 +22,8 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.simulation.experiment import Experiment, SimulatedFlight, constants_at, simulate
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, triad
 
+DAYS_BETWEEN = 7
+"""Sessions of a vehicle."""
 FIRST_FLIGHT = datetime(2026, 1, 12, 8, 0, tzinfo=UTC)
 LATENCY_NS = {"imu": 400_000, "vps": 4_800_000}
 
@@ -34,6 +36,7 @@ def write_flights(
     sessions: int = 1,
     flights: int = 1,
     log_format: str = "mcap",
+    first: datetime = FIRST_FLIGHT,
 ) -> list[Path]:
     """Write an archive of simulated flights and return the logs, sorted.
 
@@ -52,6 +55,8 @@ def write_flights(
         How many vehicles, sessions of each, flights in each.
     log_format : {"mcap", "csv", "ulog"}
         One MCAP file, a folder with imu.csv and vps.csv, or one ULog file with PX4's raw topics.
+    first : datetime
+        When the first flight starts, with a time zone; default: 2026-01-12, 08:00 UTC.
 
     Raises
     ------
@@ -80,7 +85,7 @@ def write_flights(
     logs = []
     for v, (vehicle_id, own) in enumerate(flown.items()):
         for k in range(sessions):
-            day = FIRST_FLIGHT + timedelta(days=7 * k)
+            day = first + timedelta(days=DAYS_BETWEEN * k)
             session = folder / vehicle_id / f"{day:%Y-%m-%d}"
             session.mkdir(parents=True, exist_ok=True)
             for i in range(flights):
