@@ -15,7 +15,7 @@ import yaml
 
 from fieldcal.cli.main import app
 
-DEPLOY = Path(__file__).parents[2] / "deploy"
+DEPLOY = Path(__file__).parents[2] / "docs" / "deploy"
 UNITS = sorted((DEPLOY / "systemd").iterdir())
 INSTALLED = "/opt/fieldcal/bin/fieldcal"
 
