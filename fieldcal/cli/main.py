@@ -18,7 +18,7 @@ from fieldcal.cli.fly import apply, compare, export
 from fieldcal.cli.interrupt import interruptible
 from fieldcal.cli.look import init, inspect
 from fieldcal.cli.onboard import onboard, refit
-from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
+from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Place, Root, Runner, Scheduler, SessionFolder, Workers
 from fieldcal.cli.pooled import plan, pooled
 from fieldcal.cli.report import report as report_command
 from fieldcal.cli.report import site
@@ -63,7 +63,7 @@ def demo(folder: Path = Path("fieldcal-demo"), /, *, warehouse: Root = None, con
     """
     from fieldcal.cli.present.demo import run_demo
 
-    return LOSSES if run_demo(folder, warehouse or folder / "fieldcal-data", config) else OK
+    return LOSSES if run_demo(folder, _root(warehouse or str(folder / "fieldcal-data")), config) else OK
 
 
 @app.command
@@ -118,7 +118,7 @@ def calibrate(
 
 @app.command
 def nightly(
-    archive: Path,
+    archive: Place,
     /,
     *,
     workers: Workers = 1,
@@ -134,11 +134,12 @@ def nightly(
     Parameters
     ----------
     archive
-        Folder of logs: ARCHIVE/<vehicle>/<session>/<log>.
+        Folder of logs: ARCHIVE/<vehicle>/<session>/<log>; or its URL in an object store (s3://, gs://, az://).
     """
-    _need_folder(archive, ReasonCode.NO_ARCHIVE, "archive")
+    from fieldcal.batch.places import archive_at
+
     where = {"runner": runner, "scheduler": scheduler}
-    return _night(archive.absolute(), None, workers, where, dry_run, as_json, warehouse, config)
+    return _night(archive_at(archive), None, workers, where, dry_run, as_json, warehouse, config)
 
 
 @app.command
@@ -159,12 +160,13 @@ def session(
     Parameters
     ----------
     folder
-        Folder of the session: ARCHIVE/<vehicle>/<session>.
+        Folder of the session: ARCHIVE/<vehicle>/<session>, or its URL.
     """
-    _need_folder(folder, ReasonCode.NO_SESSION, "session folder")
-    own = folder.absolute()
+    from fieldcal.batch.places import session_at
+
+    archive, own = session_at(folder)
     where = {"runner": runner, "scheduler": scheduler}
-    return _night(own.parent.parent, own, workers, where, dry_run, as_json, warehouse, config)
+    return _night(archive, own, workers, where, dry_run, as_json, warehouse, config)
 
 
 @app.command
@@ -357,7 +359,7 @@ def _night(
     where: dict[str, str | None],
     dry: bool,
     as_json: bool,
-    warehouse: Path | None,
+    warehouse: str | None,
     config: Path | None,
 ) -> int:
     from fieldcal.cli.show import console, print_json
@@ -389,7 +391,7 @@ def _night(
     return OK if result["ok"] == len(result["logs"]) else LOSSES
 
 
-def _root(warehouse: Path | None) -> Path:
+def _root(warehouse: str | None) -> Path:
     from fieldcal.warehouse import Warehouse
 
     return Warehouse(warehouse).root

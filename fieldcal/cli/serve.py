@@ -102,14 +102,18 @@ def trigger(
     from fieldcal.errors import FieldcalError
     from fieldcal.flows.trigger import server_address
     from fieldcal.flows.trigger import trigger as ask
+    from fieldcal.remote.url import is_url
     from fieldcal.warehouse import Warehouse
 
-    if not folder.is_dir():
+    if is_url(folder):
+        told = f"{folder} is a URL, and servers are told of folders; run `fieldcal session {folder}` itself."
+        raise FieldcalError(ReasonCode.WRONG_OPTION, told)
+    if not Path(folder).is_dir():
         raise FieldcalError(ReasonCode.NO_SESSION, f"There is no session folder at {folder}.")
     root = Warehouse(warehouse).root
     url = server_address(root)
-    changes = {"warehouse": warehouse, "config": config}
-    asked = ask(url, folder.absolute(), **{name: str(path.absolute()) for name, path in changes.items() if path})
+    changes = {"warehouse": str(root.absolute()) if warehouse else None, "config": config and str(config.absolute())}
+    asked = ask(url, Path(folder).absolute(), **{name: path for name, path in changes.items() if path})
     if as_json:
         print_json(asked)
     else:

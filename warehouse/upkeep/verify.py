@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any, TypedDict, cast
 
 from fieldcal.errors import FieldcalError
-from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse import checksums
 from fieldcal.warehouse.content import content_sha256
-from fieldcal.warehouse.errors import WarehouseError, disk
+from fieldcal.warehouse.errors import WarehouseError, disk, no_warehouse
 from fieldcal.warehouse.files import TEMPORARY, file_sha256
 from fieldcal.warehouse.layout import FORMER_PARTITION, PARTITION, SITE, history_files, under
 from fieldcal.warehouse.sealed import BrokenSeal, unseal
@@ -65,9 +64,7 @@ def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path],
         `no_warehouse`: there is nothing at `root`.
     """
     if not root.is_dir():
-        raise WarehouseError(
-            ReasonCode.NO_WAREHOUSE, f"There is no warehouse at {root}; run `fieldcal nightly` or give --warehouse."
-        )
+        raise no_warehouse(root)
     found = [*_recorded_files(root), *_stage_files(root), *night_files(root), *_site_files(root)]
     if archive is not None:
         if log_sha256 is None:

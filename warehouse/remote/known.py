@@ -1,0 +1,94 @@
+"""What a local copy of a warehouse knows: whose copy it is, and which heads it follows."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TypeVar
+
+from fieldcal.reason_codes import ReasonCode
+from fieldcal.remote.cache import WAREHOUSES, origin
+from fieldcal.remote.objects import Objects
+from fieldcal.remote.url import below
+from fieldcal.warehouse.errors import WarehouseError
+from fieldcal.warehouse.files import write_bytes
+from fieldcal.warehouse.remote.heads import HEADS, Head, Kept, decoded, name_of
+from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
+
+T = TypeVar("T")
+AT_ONCE = 8
+"""Requests under way together."""
+
+
+class Gone(Exception):
+    """An object that a head named is not there: what the head names now is."""
+
+    def __init__(self, key: str) -> None:
+        super().__init__(key)
+        self.key = key
+
+
+def objects_of(root: Path) -> Objects | None:
+    """The object store of which a root is the copy; None of a warehouse on this machine."""
+    found = origin(WAREHOUSES, root)
+    return None if found is None or found[0] != root else Objects(found[1])
+
+
+def known_head(root: Path, name: str) -> Head | None:
+    """The head that the copy follows; None of a vehicle that it knows nothing of."""
+    try:
+        return decoded(str(unseal(_place(root, name).read_bytes())["head"]).encode())
+    except (OSError, BrokenSeal, KeyError, ValueError):
+        return None
+
+
+def known_tags(root: Path) -> dict[str, str | None]:
+    """Vehicles, by their names in paths, with the tags of the heads that the copy follows."""
+    return {name_of(path.name): _tag(path) for path in sorted((root / "remote" / HEADS).glob("*.json"))}
+
+
+def know_head(root: Path, name: str, head: Head, e_tag: str | None) -> None:
+    """Remember the head that the copy follows; without a tag there is none."""
+    if e_tag is None:
+        _place(root, name).unlink(missing_ok=True)
+    else:
+        write_bytes(_place(root, name), seal({"e_tag": e_tag, "head": head.encoded().decode()}), durable=False)
+
+
+def fetched(objects: Objects, one: Kept) -> bytes:
+    """The content of an object, held against its sha256.
+
+    Raises
+    ------
+    Gone
+        It is not there.
+    RemoteError, WarehouseError
+        `damaged_file`, or the store's refusal.
+    """
+    found = objects.get(one.key)
+    if found is None:
+        raise Gone(one.key)
+    if hashlib.sha256(found[0]).hexdigest() != one.sha256:
+        told = f"{below(objects.url, one.key)} is damaged: its sha256 differs. Restore it, or a whole copy of it."
+        raise WarehouseError(ReasonCode.DAMAGED_FILE, told)
+    return found[0]
+
+
+def in_threads(do: Callable[[T], object], over: Iterable[T]) -> None:
+    """Some requests at a time; the first error is raised."""
+    with ThreadPoolExecutor(AT_ONCE) as threads:
+        for _ in threads.map(do, over):
+            pass
+
+
+def _tag(path: Path) -> str | None:
+    try:
+        return str(unseal(path.read_bytes())["e_tag"])
+    except (OSError, BrokenSeal, KeyError):
+        return None
+
+
+def _place(root: Path, name: str) -> Path:
+    return root / "remote" / HEADS / f"{name}.json"
