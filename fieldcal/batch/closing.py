@@ -8,10 +8,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from fieldcal.batch.sources import TRENDS, sources
+from fieldcal.batch.trends import INPUTS, update_trends
 from fieldcal.config.configuration import Alerts
 from fieldcal.names import Json
 from fieldcal.provenance.run_key import run_key
-from fieldcal.schemas import FLEET_TABLES, FLIGHT_TABLES, HISTORY_TABLES, TABLES
+from fieldcal.schemas import FLEET_TABLES, HISTORY_TABLES, TABLES
 from fieldcal.schemas.arrow import VERSION_KEY
 from fieldcal.trends.changes import Change, changes, last_usable
 from fieldcal.warehouse import Warehouse
@@ -22,11 +23,12 @@ from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import history_files
 from fieldcal.warehouse.lock import fleet_lock
 from fieldcal.warehouse.publish import settle
+from fieldcal.warehouse.remote.copy import refresh
+from fieldcal.warehouse.remote.share import share
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 from fieldcal.warehouse.store import read_facts
 from fieldcal.warehouse.upkeep.verify import night_files
 
-INPUTS = (*FLIGHT_TABLES, "decision")
 MOST_PAGES = 10
 
 
@@ -55,6 +57,7 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
     """
     now = datetime.now(UTC)
     with fleet_lock(root):
+        refresh(root)
         assure(root, [path for table in HISTORY_TABLES for path in history_files(root, table)], strict=True)
         _forget_damaged(root)
         before = _remembered(root)
@@ -64,11 +67,8 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
         former = Warehouse(root).scan("drift").collect()
         made_from = _made_from(root)
         if before.get("made_from") != made_from or before.get("made") != history_digest(root, FLEET_TABLES):
-            from fieldcal.trends.drift_table import update_drift
-            from fieldcal.trends.pooled.table import update_pooled
-
-            update_drift(root)
-            update_pooled(root)
+            update_trends(root)
+            made_from = _made_from(root)
         table = Warehouse(root).scan("drift").collect()
         # With other limits than last time, what they make old is told whenever it passed them.
         limits: dict[str, Json] = {"expires_days": alerts.expires_days, "idle_days": alerts.idle_days}
@@ -78,7 +78,9 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
         made = history_digest(root, FLEET_TABLES)
         record = {"at": now.isoformat(), "made_from": made_from, "made": made, "alerts": limits}
         write_bytes(_place(root), seal(record), durable=False)
-        return Closing(told, _reports(root, told), _site(root, alerts, now))
+        closing = Closing(told, _reports(root, told), _site(root, alerts, now))
+        share(root)
+        return closing
 
 
 def _reports(root: Path, told: Sequence[Change]) -> Path:

@@ -56,6 +56,7 @@ def export(
         File to write; else stdout.
     """
     from fieldcal.exports import AUTOPILOTS
+    from fieldcal.remote.url import RemoteError
     from fieldcal.warehouse.files import write_bytes
     from fieldcal.words.talk import say
 
@@ -74,7 +75,7 @@ def export(
         write_bytes(output, result.text.encode())
     try:
         root.record_export(constants, to, result, author=author, temperature_degc=at_temperature)
-    except fieldcal.WarehouseError as error:
+    except (fieldcal.WarehouseError, RemoteError) as error:
         say(f"That it was exported is not remembered. {error}")
     return 0
 

@@ -86,12 +86,12 @@ class Objects:
             meta = found.meta
         return Listed(key, meta["size"], meta["e_tag"] or "", meta["last_modified"]), digest.hexdigest()
 
-    def put(self, key: str, data: bytes | Path) -> None:
-        """Write an object, which is there whole or not at all; one that is there is replaced."""
+    def put(self, key: str, data: bytes | Path, kind: str | None = None) -> None:
+        """Write an object, which is there whole or not at all; one that is there is replaced. `kind`: for browsers."""
         import obstore
 
         with _told(self.url):
-            obstore.put(self._store, key, data)
+            obstore.put(self._store, key, data, attributes={"Content-Type": kind} if kind else None)
 
     def swap(self, key: str, data: bytes, e_tag: str | None) -> str | None:
         """Replace an object if it still has the tag `e_tag` (None: create it); its new tag, or None where another was

@@ -18,6 +18,7 @@ from fieldcal.site.snapshot import Snapshot
 from fieldcal.site.vehicle_pages import flight_files, vehicle_files
 from fieldcal.warehouse.layout import SITE, prepare
 from fieldcal.warehouse.questions import existing
+from fieldcal.warehouse.remote.pages import at_hand
 
 INDEX = "index.html"
 ALWAYS = f"{DATA}/fleet.js"
@@ -49,7 +50,7 @@ def write_site(root: Path, alerts: Alerts | None = None, *, now: datetime | None
     ledgers = Ledger.all_of(root)
     code = code_digest()
     for vehicle_id, one in fitness.items():
-        own = flights.filter(vehicle_id=vehicle_id)["flight_id"].to_list()
+        own = [one for one in flights.filter(vehicle_id=vehicle_id)["flight_id"] if at_hand(root, one)]
         _vehicle(snapshot, one, own, links, ledgers.pop(vehicle_id, None), written, code)
     _fleet(snapshot, fitness, links, written)
     for ledger in ledgers.values():

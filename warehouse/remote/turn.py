@@ -77,7 +77,7 @@ def _committed(root: Path, objects: Objects, before: Head, e_tag: str | None, fl
         else:
             files[table] = Kept.new(sha256, path.stat().st_size)
             fresh.append((files[table].key, path))
-    signals, own = with_own_signals(root, objects, before, flights)
+    signals, own = with_own_signals(root, objects, before, flights) if files else (None, [])
     if files == before.files and signals == before.signals:
         return True
     in_threads(partial(_put, objects), [*fresh, *own])

@@ -13,6 +13,7 @@ from fieldcal.warehouse.content import content_sha256
 from fieldcal.warehouse.errors import WarehouseError, disk, no_warehouse
 from fieldcal.warehouse.files import TEMPORARY, file_sha256
 from fieldcal.warehouse.layout import FORMER_PARTITION, PARTITION, SITE, history_files, under
+from fieldcal.warehouse.remote.whole import remote_files
 from fieldcal.warehouse.sealed import BrokenSeal, unseal
 from fieldcal.warehouse.stage_store import RECORD, broken_outputs, outputs_of
 from fieldcal.warehouse.store import read_table
@@ -66,6 +67,7 @@ def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path],
     if not root.is_dir():
         raise no_warehouse(root)
     found = [*_recorded_files(root), *_stage_files(root), *night_files(root), *_site_files(root)]
+    found += remote_files(root)
     if archive is not None:
         if log_sha256 is None:
             raise ValueError("log_sha256 is needed to check an archive")
