@@ -136,7 +136,7 @@ def nightly(
     archive
         Folder of logs: ARCHIVE/<vehicle>/<session>/<log>; or its URL in an object store (s3://, gs://, az://).
     """
-    from fieldcal.batch.places import archive_at
+    from fieldcal.remote.places import archive_at
 
     where = {"runner": runner, "scheduler": scheduler}
     return _night(archive_at(archive), None, workers, where, dry_run, as_json, warehouse, config)
@@ -162,7 +162,7 @@ def session(
     folder
         Folder of the session: ARCHIVE/<vehicle>/<session>, or its URL.
     """
-    from fieldcal.batch.places import session_at
+    from fieldcal.remote.places import session_at
 
     archive, own = session_at(folder)
     where = {"runner": runner, "scheduler": scheduler}

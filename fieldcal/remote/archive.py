@@ -16,7 +16,7 @@ from fieldcal.reason_codes import ReasonCode
 from fieldcal.remote.cache import ARCHIVES, note_copy
 from fieldcal.remote.content import here, stand_in, version_ns
 from fieldcal.remote.objects import Listed, Objects
-from fieldcal.remote.url import RemoteError, above, checked
+from fieldcal.remote.url import RemoteError, checked
 
 READ_AT_ONCE = 1 << 20
 """Bytes of a file that is no log, and is fetched with the listing: settings, the description of a bag."""
@@ -48,21 +48,6 @@ def local_archive(url: str) -> Path:
             with here(folder / key):
                 pass
     return folder
-
-
-def local_log(url: str) -> Path:
-    """The log that a URL of ARCHIVE/<vehicle>/<session>/<log> names, in the copy of its archive.
-
-    Raises
-    ------
-    RemoteError
-        As `Objects`; `not_found`.
-    """
-    archive, place = above(url, 3)
-    log = local_archive(archive) / place
-    if not log.exists():
-        raise RemoteError(ReasonCode.NOT_FOUND, f"There is no log at {url}.")
-    return log
 
 
 def _can_be_a_file(key: str) -> bool:

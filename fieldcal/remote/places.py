@@ -1,4 +1,4 @@
-"""Where a night reads and writes: folders on this machine, or URLs, of which it has local copies."""
+"""Where logs are read: folders on this machine, or URLs, of which there are local copies."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ from pathlib import Path
 from fieldcal.errors import FieldcalError
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.remote.archive import local_archive
+from fieldcal.remote.content import here
 from fieldcal.remote.url import above, is_url
-from fieldcal.warehouse import Warehouse
+
+LEVELS_OF_A_SESSION, LEVELS_OF_A_LOG = 2, 3
+"""ARCHIVE/<vehicle>/<session>/<log>."""
 
 
 def archive_at(place: str | Path) -> Path:
@@ -33,16 +36,29 @@ def session_at(place: str | Path) -> tuple[Path, Path]:
     if not is_url(place):
         folder = _folder(place, ReasonCode.NO_SESSION, "session folder")
         return folder.parent.parent, folder
-    archive, session = above(str(place), 2)
+    archive, session = above(str(place), LEVELS_OF_A_SESSION)
     folder = local_archive(archive)
     if not (folder / session).is_dir():
         raise FieldcalError(ReasonCode.NO_SESSION, f"There is no session folder at {place}.")
     return folder, folder / session
 
 
-def warehouse_at(place: str | Path | None) -> Path:
-    """Data root of a warehouse; of one by URL the copy, brought up to date."""
-    return Warehouse(place).root
+def log_at(place: str | Path) -> Path:
+    """Path of a log; of one by URL its place in the copy of its archive, with its content.
+
+    Raises
+    ------
+    FieldcalError
+        `not_found`, or the store's refusal.
+    """
+    if not is_url(place):
+        return Path(place)
+    archive, name = above(str(place), LEVELS_OF_A_LOG)
+    log = local_archive(archive) / name
+    if not log.exists():
+        raise FieldcalError(ReasonCode.NOT_FOUND, f"There is no log at {place}.")
+    with here(log):
+        return log
 
 
 def _folder(place: str | Path, reason_code: ReasonCode, what: str) -> Path:
