@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fieldcal.cli.options import AsJson, Config, UnusedConfig, UnusedRoot
+from fieldcal.cli.options import AsJson, Config, Place, UnusedConfig, UnusedRoot
 from fieldcal.words.printable import printable
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ WIDTH = 80
 LABEL = 10
 
 
-def inspect(log: Path, /, *, as_json: AsJson = False, config: Config = None, warehouse: UnusedRoot = None) -> int:
+def inspect(log: Place, /, *, as_json: AsJson = False, config: Config = None, warehouse: UnusedRoot = None) -> int:
     """Show what is in a log, and what is unknown or assumed of it. Nothing is calibrated, nothing written.
 
     Parameters
@@ -31,8 +31,9 @@ def inspect(log: Path, /, *, as_json: AsJson = False, config: Config = None, war
     from fieldcal.cli.show import print_json
     from fieldcal.flight.inspection import inspect_log
     from fieldcal.names import Verdict
+    from fieldcal.remote.places import log_at
 
-    found = inspect_log(log, config)
+    found = inspect_log(log_at(log), config)
     if as_json:
         print_json(asdict(found))
     else:

@@ -68,7 +68,7 @@ def demo(folder: Path = Path("fieldcal-demo"), /, *, warehouse: Root = None, con
 
 @app.command
 def calibrate(
-    log: Path,
+    log: Place,
     /,
     *,
     vehicle: str | None = None,
@@ -222,7 +222,7 @@ def sql(
 @app.command
 def verify(
     *,
-    archive: Path | None = None,
+    archive: Place | None = None,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -236,12 +236,16 @@ def verify(
     """
     from fieldcal.cli.show import print_json
     from fieldcal.logs import log_sha256
+    from fieldcal.remote.content import here
+    from fieldcal.remote.places import archive_at
     from fieldcal.warehouse.upkeep.verify import verify as check
     from fieldcal.words.talk import say
 
-    if archive is not None:
-        _need_folder(archive, ReasonCode.NO_ARCHIVE, "archive")
-    result = check(_root(warehouse), archive, log_sha256)
+    def sha256_of(log: Path) -> str:
+        with here(log):
+            return log_sha256(log)
+
+    result = check(_root(warehouse), None if archive is None else archive_at(archive), sha256_of)
     if as_json:
         print_json(result)
     else:
@@ -395,11 +399,6 @@ def _root(warehouse: str | None) -> Path:
     from fieldcal.warehouse import Warehouse
 
     return Warehouse(warehouse).root
-
-
-def _need_folder(folder: Path, reason_code: ReasonCode, what: str) -> None:
-    if not folder.is_dir():
-        raise _usage(reason_code, f"There is no {what} at {folder}.")
 
 
 def _usage(reason_code: ReasonCode, sentence: str) -> Exception:

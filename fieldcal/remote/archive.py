@@ -34,6 +34,8 @@ def local_archive(url: str) -> Path:
     """
     url = checked(url)
     listed = {one.key: one for one in Objects(url).listed() if _can_be_a_file(one.key)}
+    folders = {parent.as_posix() for key in listed for parent in PurePosixPath(key).parents}
+    listed = {key: one for key, one in listed.items() if key not in folders}
     if not listed:
         raise RemoteError(ReasonCode.NO_ARCHIVE, f"There is no archive at {url}: nothing lies below it.")
     folder = note_copy(ARCHIVES, url)
