@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -16,30 +16,36 @@ from fieldcal.remote.content import here
 from fieldcal.remote.url import RemoteError
 
 AT_ONCE = 8
-Ledger = Mapping[str, tuple[tuple[int, ...], str]]
-"""Path of a log → the stamp of its files when they were hashed, sha256."""
+Hashed = tuple[tuple[int, ...], str]
+"""The stamp of a log's files when they were hashed, and its sha256."""
+Ledger = Mapping[str, Hashed]
+"""By the path of a log."""
 
 
 def find_jobs(
-    archive: Path, configuration: Configuration, session: Path | None = None, ledger: Ledger | None = None
+    archive: Path,
+    configuration: Configuration,
+    session: Path | None = None,
+    ledger: Ledger | None = None,
+    elsewhere: Callable[[LogFile], Hashed | None] | None = None,
 ) -> list[Job]:
     """All logs of an archive, or of one session folder of it, in the order of their place.
 
-    Each is hashed, unless the `ledger` knows it as it is.
+    Each is hashed, unless the `ledger`, or whoever has seen it `elsewhere`, knows it as it is.
     """
     logs: Iterable[LogFile] = find_logs(archive, configuration.logs)
     if session is not None:
         inside = session.resolve()
         logs = (log for log in logs if log.path.resolve().is_relative_to(inside))
     with ThreadPoolExecutor(AT_ONCE) as threads:  # by URL each that is new is fetched
-        return list(threads.map(partial(_job, ledger=ledger or {}), logs))
+        return list(threads.map(partial(_job, ledger=ledger or {}, elsewhere=elsewhere), logs))
 
 
-def _job(log: LogFile, ledger: Ledger) -> Job:
+def _job(log: LogFile, ledger: Ledger, elsewhere: Callable[[LogFile], Hashed | None] | None) -> Job:
     known = (str(log.path), log.log_uri, log.vehicle_id, log.session_id, log.log_format)
     try:
         stamp = file_stamp(log.path)
-        remembered = ledger.get(str(log.path))
+        remembered = ledger.get(str(log.path)) or (elsewhere(log) if elsewhere else None)
         if remembered and remembered[0] == stamp:
             sha256 = remembered[1]
         else:
