@@ -15,6 +15,7 @@ import pytest
 from moto.server import ThreadedMotoServer
 from obstore.store import from_url
 
+from fieldcal.remote import objects
 from fieldcal.remote.cache import FOLDER
 
 KEYS = {
@@ -34,6 +35,7 @@ def running_store() -> Iterator[str]:
     server.start()
     _, port = server.get_host_and_port()
     address = f"http://127.0.0.1:{port}"
+    objects.opened.cache_clear()  # of another server
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {**KEYS, "AWS_ENDPOINT_URL": address}.items():
             patch.setenv(name, value)

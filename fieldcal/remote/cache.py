@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import re
+from functools import cache
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -49,7 +50,7 @@ def origin(kind: str, path: Path) -> tuple[Path, str] | None:
         return None
     folder = root / path.relative_to(root).parts[0]
     try:
-        return folder, str(json.loads(_note(folder).read_bytes())["url"])
+        return folder, _url_in(_note(folder))
     except (OSError, ValueError, KeyError):
         return None
 
@@ -58,6 +59,11 @@ def called(path: Path) -> str:
     """What people call a folder: by its URL, where it is a copy."""
     found = origin(ARCHIVES, path) or origin(WAREHOUSES, path)
     return str(path) if found is None else "/".join([found[1], *path.relative_to(found[0]).parts])
+
+
+@cache
+def _url_in(note: Path) -> str:
+    return str(json.loads(note.read_bytes())["url"])
 
 
 def _note(folder: Path) -> Path:

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.remote.credentials import given_by_profile
 from fieldcal.remote.url import SCHEMES, RemoteError
 
 if TYPE_CHECKING:
+    from obstore import UpdateVersion
     from obstore.store import ObjectStore
 
 MOST_RETRIES = 6
@@ -33,6 +34,13 @@ class Listed:
     modified: datetime
 
 
+class Tag(NamedTuple):
+    """What tells one version of an object from others: S3 and Azure by `e_tag`, Google by `version`."""
+
+    e_tag: str
+    version: str | None
+
+
 class Objects:
     """The objects below a URL (`url.checked`), by keys relative to it.
 
@@ -44,7 +52,7 @@ class Objects:
 
     def __init__(self, url: str) -> None:
         self.url = url
-        self._store = _opened(url)
+        self._store = opened(url)
 
     def listed(self, prefix: str = "") -> list[Listed]:
         """All objects whose key begins with the folders `prefix`."""
@@ -54,14 +62,14 @@ class Objects:
             found = [one for page in obstore.list(self._store, prefix or None) for one in page]
         return [Listed(one["path"], one["size"], one["e_tag"] or "", one["last_modified"]) for one in found]
 
-    def get(self, key: str) -> tuple[bytes, str] | None:
+    def get(self, key: str) -> tuple[bytes, Tag] | None:
         """Content and tag of an object; None where there is none."""
         import obstore
 
         with _told(self.url):
             try:
                 found = obstore.get(self._store, key)
-                return bytes(found.bytes()), found.meta["e_tag"] or ""
+                return bytes(found.bytes()), Tag(found.meta["e_tag"] or "", found.meta["version"])
             except FileNotFoundError as error:
                 if _is_about_bucket(error):
                     raise
@@ -93,15 +101,18 @@ class Objects:
         with _told(self.url):
             obstore.put(self._store, key, data, attributes={"Content-Type": kind} if kind else None)
 
-    def swap(self, key: str, data: bytes, e_tag: str | None) -> str | None:
-        """Replace an object if it still has the tag `e_tag` (None: create it); its new tag, or None where another was
-        faster."""
+    def swap(self, key: str, data: bytes, tag: Tag | None) -> str | None:
+        """Replace an object if it is still the version `tag` (None: create it); the new one's `e_tag`, or None where
+        another was faster."""
         import obstore
         from obstore.exceptions import AlreadyExistsError, PreconditionError
 
+        mode: Literal["create"] | UpdateVersion = "create"
+        if tag is not None:
+            mode = {"e_tag": tag.e_tag} if tag.version is None else {"e_tag": tag.e_tag, "version": tag.version}
         with _told(self.url):
             try:
-                done = obstore.put(self._store, key, data, mode="create" if e_tag is None else {"e_tag": e_tag})
+                done = obstore.put(self._store, key, data, mode=mode)
             except (AlreadyExistsError, PreconditionError):
                 return None
             except FileNotFoundError as error:  # it was removed by hand
@@ -127,7 +138,8 @@ class Objects:
 
 
 @cache
-def _opened(url: str) -> ObjectStore:
+def opened(url: str) -> ObjectStore:
+    """The store of a URL, once in a process."""
     try:
         from obstore.store import from_url
     except ImportError as error:

@@ -50,8 +50,10 @@ def write_site(root: Path, alerts: Alerts | None = None, *, now: datetime | None
     ledgers = Ledger.all_of(root)
     code = code_digest()
     for vehicle_id, one in fitness.items():
-        own = [one for one in flights.filter(vehicle_id=vehicle_id)["flight_id"] if at_hand(root, one)]
-        _vehicle(snapshot, one, own, links, ledgers.pop(vehicle_id, None), written, code)
+        ledger = ledgers.pop(vehicle_id, None) or Ledger(root, vehicle_id)
+        every = flights.filter(vehicle_id=vehicle_id)["flight_id"]
+        own = [flight for flight in every if flight in ledger.of_flights or at_hand(root, flight)]
+        _vehicle(snapshot, one, own, links, ledger, written, code)
     _fleet(snapshot, fitness, links, written)
     for ledger in ledgers.values():
         ledger.forget()
@@ -64,12 +66,11 @@ def _vehicle(
     one: Fitness,
     flights: list[str],
     links: Links,
-    ledger: Ledger | None,
+    ledger: Ledger,
     written: Written,
     code: str,
 ) -> None:
     """The vehicle's pages and its flights', where what they show, or the code that makes them, is another."""
-    ledger = ledger or Ledger(snapshot.root, one.vehicle_id)
     of = vehicle_digest(snapshot, one, code)
     if ledger.of == of and all(written.has(files) for files in (ledger.files, *ledger.of_flights.values())):
         written.keep(ledger)

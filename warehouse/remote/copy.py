@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.remote.cache import WAREHOUSES, note_copy
-from fieldcal.remote.objects import Objects
+from fieldcal.remote.objects import Objects, Tag
 from fieldcal.remote.url import below, checked
 from fieldcal.schemas import HISTORY_TABLES
 from fieldcal.warehouse import checksums
@@ -16,7 +16,16 @@ from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import PARTITION, checksum_path, encode_id, prepare
 from fieldcal.warehouse.lock import named_lock
 from fieldcal.warehouse.remote.heads import HEADS, Head, head_key, name_of, read_head
-from fieldcal.warehouse.remote.known import Gone, fetched, in_threads, know_head, known_head, known_tags, objects_of
+from fieldcal.warehouse.remote.known import (
+    Gone,
+    fetched,
+    in_threads,
+    know_head,
+    known_head,
+    known_names,
+    known_tag,
+    objects_of,
+)
 from fieldcal.warehouse.remote.signals import drop_replaced
 from fieldcal.warehouse.sealed import BrokenSeal
 
@@ -43,7 +52,7 @@ def refresh(root: Path) -> bool:
     if objects is None:
         return False
     listed = {name: one.e_tag for one in objects.listed(HEADS) if one.key == head_key(name := name_of(one.key))}
-    known = known_tags(root)
+    known = {name: _tag_if_there(root, name) for name in known_names(root)}
     ahead = {path.name for path in (root / "remote" / "ahead").glob("*")}
     names = {name for name in listed.keys() | known.keys() if listed.get(name) != known.get(name)} | ahead
     if names:
@@ -52,19 +61,34 @@ def refresh(root: Path) -> bool:
     return bool(names)
 
 
+def _tag_if_there(root: Path, name: str) -> str | None:
+    """The tag of the head that the copy follows, while its files are there: any may be removed to be fetched anew."""
+    head = known_head(root, name)
+    files = {} if head is None else {_place(root, name, table): one.size for table, one in head.files.items()}
+    try:
+        there = all(path.stat().st_size == size for path, size in files.items())
+    except OSError:
+        return None
+    return known_tag(root, name) if there else None
+
+
+def _place(root: Path, name: str, table: str) -> Path:
+    return root / "tables" / table / f"{PARTITION}{name}" / "part.parquet"
+
+
 def _follow(root: Path, objects: Objects, name: str) -> None:
     with named_lock(root, name):
         take_head(root, objects, name)
 
 
-def take_head(root: Path, objects: Objects, name: str, vehicle_id: str = "") -> tuple[Head, str | None]:
+def take_head(root: Path, objects: Objects, name: str, vehicle_id: str = "") -> tuple[Head, Tag | None]:
     """Make a vehicle's files in the copy those of its head; whoever calls has the vehicle's lock. The head and its tag.
 
     What a writer that died had changed in the copy, and no head ever named, is undone by it.
     """
     for attempt in range(_TRIES):
-        head, e_tag = read_head(objects, name, vehicle_id)
-        if e_tag is not None and encode_id(head.vehicle_id) != name:
+        head, tag = read_head(objects, name, vehicle_id)
+        if tag is not None and encode_id(head.vehicle_id) != name:
             told = f"{below(objects.url, head_key(name))} is the head of another vehicle; restore its own."
             raise WarehouseError(ReasonCode.DAMAGED_FILE, told)
         try:
@@ -72,13 +96,13 @@ def take_head(root: Path, objects: Objects, name: str, vehicle_id: str = "") -> 
                 _take_table(root, objects, name, head, table)
             drop_replaced(root, objects, known_head(root, name), head)
         except Gone as gone:
-            if attempt + 1 < _TRIES and read_head(objects, name)[1] != e_tag:
+            if attempt + 1 < _TRIES and read_head(objects, name)[1] != tag:
                 continue
             told = f"{below(objects.url, gone.key)} is not there, though a head names it; restore it (vehicle {name})."
             raise WarehouseError(ReasonCode.DAMAGED_FILE, told) from gone
-        know_head(root, name, head, e_tag)
+        know_head(root, name, head, None if tag is None else tag.e_tag)
         end_ahead(root, name)
-        return head, e_tag
+        return head, tag
     raise AssertionError
 
 
@@ -96,7 +120,7 @@ def end_ahead(root: Path, name: str) -> None:
 
 
 def _take_table(root: Path, objects: Objects, name: str, head: Head, table: str) -> None:
-    path, one = root / "tables" / table / f"{PARTITION}{name}" / "part.parquet", head.files.get(table)
+    path, one = _place(root, name, table), head.files.get(table)
     if one is None:
         with disk(path, "removed"):
             path.unlink(missing_ok=True)

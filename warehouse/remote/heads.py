@@ -9,7 +9,7 @@ from typing import Any, cast
 from uuid import uuid4
 
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.remote.objects import Objects
+from fieldcal.remote.objects import Objects, Tag
 from fieldcal.remote.url import below
 from fieldcal.schemas import HISTORY_TABLES
 from fieldcal.warehouse.errors import WarehouseError
@@ -88,7 +88,7 @@ def name_of(key: str) -> str:
     return key.rpartition("/")[2].removesuffix(".json")
 
 
-def read_head(objects: Objects, name: str, vehicle_id: str = "") -> tuple[Head, str | None]:
+def read_head(objects: Objects, name: str, vehicle_id: str = "") -> tuple[Head, Tag | None]:
     """The head as it is now and its tag; an empty one and None where there is none yet.
 
     Raises

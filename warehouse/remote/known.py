@@ -44,9 +44,17 @@ def known_head(root: Path, name: str) -> Head | None:
         return None
 
 
-def known_tags(root: Path) -> dict[str, str | None]:
-    """Vehicles, by their names in paths, with the tags of the heads that the copy follows."""
-    return {name_of(path.name): _tag(path) for path in sorted((root / "remote" / HEADS).glob("*.json"))}
+def known_names(root: Path) -> list[str]:
+    """Vehicles of which the copy follows a head, by their names in paths."""
+    return sorted(name_of(path.name) for path in (root / "remote" / HEADS).glob("*.json"))
+
+
+def known_tag(root: Path, name: str) -> str | None:
+    """The tag of the head that the copy follows."""
+    try:
+        return str(unseal(_place(root, name).read_bytes())["e_tag"])
+    except (OSError, BrokenSeal, KeyError):
+        return None
 
 
 def know_head(root: Path, name: str, head: Head, e_tag: str | None) -> None:
@@ -81,13 +89,6 @@ def in_threads(do: Callable[[T], object], over: Iterable[T]) -> None:
     with ThreadPoolExecutor(AT_ONCE) as threads:
         for _ in threads.map(do, over):
             pass
-
-
-def _tag(path: Path) -> str | None:
-    try:
-        return str(unseal(path.read_bytes())["e_tag"])
-    except (OSError, BrokenSeal, KeyError):
-        return None
 
 
 def _place(root: Path, name: str) -> Path:

@@ -15,7 +15,7 @@ from fieldcal.warehouse.errors import disk
 from fieldcal.warehouse.files import file_sha256, write_bytes
 from fieldcal.warehouse.layout import SIGNAL_PARTITION, checksum_path, encode_id
 from fieldcal.warehouse.remote.heads import Head, Kept
-from fieldcal.warehouse.remote.known import fetched, in_threads, known_head, known_tags, objects_of
+from fieldcal.warehouse.remote.known import fetched, in_threads, known_head, known_names, objects_of
 from fieldcal.warehouse.sealed import seal, unseal
 
 _PLACE = re.compile(r"[a-z_]+(\.[0-9]+)?/[A-Za-z0-9%~-][A-Za-z0-9%~._-]*")
@@ -65,7 +65,7 @@ def fetch_signals(root: Path, table: str, vehicle_id: str | None = None, flight_
     objects = objects_of(root)
     if objects is None:
         return
-    names = [encode_id(vehicle_id)] if vehicle_id is not None else sorted(known_tags(root))
+    names = [encode_id(vehicle_id)] if vehicle_id is not None else known_names(root)
     wanted = list(_absent(root, objects, names, table, None if flight_id is None else encode_id(flight_id)))
     in_threads(partial(_fetch, root, objects), wanted)
 

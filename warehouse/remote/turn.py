@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.remote.objects import Objects
+from fieldcal.remote.objects import Objects, Tag
 from fieldcal.schemas import HISTORY_TABLES
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.files import file_sha256
@@ -50,10 +50,10 @@ def in_turn(
             return change()
         name, give_up, wait_s = encode_id(vehicle_id), time.monotonic() + timeout_s, _FIRST_WAIT_S
         while time.monotonic() < give_up:
-            before, e_tag = take_head(root, objects, name, vehicle_id)
+            before, tag = take_head(root, objects, name, vehicle_id)
             begin_ahead(root, name)
             result = change()
-            if _committed(root, objects, before, e_tag, flights):
+            if _committed(root, objects, before, tag, flights):
                 end_ahead(root, name)
                 return result
             time.sleep(random.uniform(0.0, wait_s))
@@ -62,7 +62,7 @@ def in_turn(
     raise WarehouseError(ReasonCode.BUSY, told)
 
 
-def _committed(root: Path, objects: Objects, before: Head, e_tag: str | None, flights: Collection[str]) -> bool:
+def _committed(root: Path, objects: Objects, before: Head, tag: Tag | None, flights: Collection[str]) -> bool:
     """Have the head name the files as they are in the copy; False where another was faster."""
     name, vehicle_id = encode_id(before.vehicle_id), before.vehicle_id
     files: dict[str, Kept] = {}
@@ -82,12 +82,13 @@ def _committed(root: Path, objects: Objects, before: Head, e_tag: str | None, fl
         return True
     in_threads(partial(_put, objects), [*fresh, *own])
     head = before.next(files, signals)
-    tag = objects.swap(head_key(name), head.encoded(), e_tag)
-    if tag is None:  # refused, or won by a try whose answer was lost
-        now, tag = read_head(objects, name)
-        if now.written != head.written or tag is None:
+    e_tag = objects.swap(head_key(name), head.encoded(), tag)
+    if e_tag is None:  # refused, or won by a try whose answer was lost
+        now, its_tag = read_head(objects, name)
+        if now.written != head.written or its_tag is None:
             return False
-    know_head(root, name, head, tag)
+        e_tag = its_tag.e_tag
+    know_head(root, name, head, e_tag)
     return True
 
 

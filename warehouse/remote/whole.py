@@ -9,7 +9,7 @@ from pathlib import Path
 from fieldcal.remote.objects import Objects
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.remote.heads import Head, Kept, live_key
-from fieldcal.warehouse.remote.known import Gone, fetched, known_head, known_tags, objects_of
+from fieldcal.warehouse.remote.known import Gone, fetched, known_head, known_names, objects_of
 from fieldcal.warehouse.remote.live import behind_head
 from fieldcal.warehouse.remote.signals import listed
 from fieldcal.warehouse.sealed import BrokenSeal
@@ -24,7 +24,7 @@ def remote_files(root: Path) -> Iterator[Problem]:
     if objects is None:
         return
     behind = behind_head(objects)
-    for name in sorted(known_tags(root)):
+    for name in known_names(root):
         head = known_head(root, name)
         if head is None:
             continue

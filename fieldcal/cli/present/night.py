@@ -13,6 +13,7 @@ from fieldcal.batch.outcome import cause, verdict_counts
 from fieldcal.cli.show import table
 from fieldcal.logs.unread import Unread, told
 from fieldcal.names import Standing, Verdict
+from fieldcal.remote.cache import called
 from fieldcal.report.fitness import fleet_fitness, ranked, remembered_alerts
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.flights import is_consequence
@@ -49,7 +50,7 @@ def print_night(console: Console, result: NightDocument, root: Path) -> None:
         console.print(table(["new", "what"], lines[:CHANGES], "What changed in the fleet"))
         if len(lines) > CHANGES:
             console.print(f"  … and {len(lines) - CHANGES} more: fieldcal drift", markup=False)
-    console.print(f"History: {root}/tables (fieldcal history, drift, sql)", markup=False)
+    console.print(f"History: {called(root)}/tables (fieldcal history, drift, sql)", markup=False)
     console.print(f"Report:  {result['report']} (fieldcal report --vehicle V, --flight ID)", markup=False)
     console.print(
         f"Site:    {result['site']} (every vehicle and flight; any web server serves its folder)", markup=False
