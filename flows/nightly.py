@@ -126,6 +126,7 @@ def carry_out(
 ) -> NightDocument:
     """Run what the plan says, within a flow run; the JSON of the night. People are told what is new in it, or that it
     failed."""
+    parallel.reaches(night.archive, night.root)
     tell_while_heard()
     with alive(night.root), telling(night) as tell:
         if watcher is not None:

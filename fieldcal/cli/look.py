@@ -42,7 +42,7 @@ def inspect(log: Place, /, *, as_json: AsJson = False, config: Config = None, wa
 
 
 def init(
-    archive: Path, /, *, as_json: AsJson = False, config: UnusedConfig = None, warehouse: UnusedRoot = None
+    archive: Place, /, *, as_json: AsJson = False, config: UnusedConfig = None, warehouse: UnusedRoot = None
 ) -> int:
     """Write a commented fieldcal.toml for an archive from what lies in it; one that is there is left as it is.
 
@@ -55,9 +55,10 @@ def init(
 
     from fieldcal.cli.show import print_json
     from fieldcal.flight.first_configuration import first_configuration, write_first_configuration
+    from fieldcal.remote.places import folder_at
     from fieldcal.words.talk import say
 
-    first = first_configuration(archive)
+    first = first_configuration(folder_at(archive, "init"))
     if first.logs:
         write_first_configuration(first)
     if as_json:

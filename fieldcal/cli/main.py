@@ -283,7 +283,7 @@ def upgrade(*, dry_run: DryRun = False, as_json: AsJson = False, warehouse: Root
 @app.command
 def doctor(
     *,
-    archive: Path | None = None,
+    archive: Place | None = None,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -299,8 +299,9 @@ def doctor(
 
     from fieldcal.cli.doctor import examine
     from fieldcal.cli.show import print_json
+    from fieldcal.remote.places import folder_at
 
-    result = examine(_root(warehouse), archive, config)
+    result = examine(_root(warehouse), folder_at(archive, "doctor --archive") if archive else None, config)
     if as_json:
         print_json(asdict(result))
     else:

@@ -43,6 +43,20 @@ def session_at(place: str | Path) -> tuple[Path, Path]:
     return folder, folder / session
 
 
+def folder_at(place: str | Path, command: str) -> Path:
+    """A place that must be a folder on this machine.
+
+    Raises
+    ------
+    FieldcalError
+        `wrong_option`: it is a URL.
+    """
+    if is_url(place):
+        told = f"fieldcal {command} takes a folder on this machine, not {place}; nightly and session take URLs."
+        raise FieldcalError(ReasonCode.WRONG_OPTION, told)
+    return Path(place)
+
+
 def log_at(place: str | Path) -> Path:
     """Path of a log; of one by URL its place in the copy of its archive, with its content.
 

@@ -28,8 +28,8 @@ from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 
 
 class Told(TypedDict):
-    """A flight, as a night told it. `of`: digest of what its results follow from; `archive`, `stamp`: where its log was
-    listed, and as what; `runs`: the executions that its rows come from."""
+    """A flight, as a night told it. `of`: digest of what its results follow from; `archive`, `stamp`: the URL where
+    its log was listed, and as what; `runs`: the executions that its rows come from."""
 
     of: str
     archive: str
@@ -78,13 +78,14 @@ class Shared:
         """Tell others of flights that were found whole and are published, with what their results follow from."""
         if self._objects is None:
             return
+        where = "" if origin(ARCHIVES, archive) is None else called(archive)
         fresh: dict[str, dict[str, Told]] = {}
         for job, of, entry in flights:
             if job.vehicle_id not in fresh:
                 fresh[job.vehicle_id], runs = {}, _runs(self._root, job.vehicle_id)
             fresh[job.vehicle_id][job.flight_id] = {
                 "of": of,
-                "archive": called(archive),
+                "archive": where,
                 "stamp": list(job.stamp),
                 "sha256": str(job.sha256),
                 "runs": runs.get(job.flight_id, []),
