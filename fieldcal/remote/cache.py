@@ -21,7 +21,7 @@ def cache_root() -> Path:
     named = os.environ.get(FOLDER)
     if named:
         return Path(named).resolve()
-    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    caches = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     return Path(caches).resolve() / "fieldcal"
 
 

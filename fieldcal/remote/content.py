@@ -12,7 +12,7 @@ from uuid import uuid4
 
 from fieldcal.file_locks import fcntl
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.remote.cache import ARCHIVES, cache_root, most_bytes, origin
+from fieldcal.remote.cache import ARCHIVES, FOLDER, cache_root, most_bytes, origin
 from fieldcal.remote.objects import Listed, Objects
 from fieldcal.remote.url import RemoteError, below
 
@@ -92,8 +92,12 @@ def _fetch(file: Path, folder: Path, url: str, told: os.stat_result) -> None:
         os.utime(beside, ns=(time.time_ns(), told.st_mtime_ns))
         _note(file)
         beside.replace(file)
+    except OSError as error:
+        why = f"{error.strerror or error}: free some space, or set {FOLDER} to another place"
+        raise RemoteError(ReasonCode.DISK_ERROR, f"{file} cannot be written ({why}).") from error
     finally:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
     _make_room(file)
 
 

@@ -48,4 +48,5 @@ def given_by_profile(url: str) -> dict[str, object]:
 
 
 def _default_file() -> Path:
-    return Path(os.environ.get("AWS_SHARED_CREDENTIALS_FILE") or Path.home() / ".aws" / "credentials")
+    named = os.environ.get("AWS_SHARED_CREDENTIALS_FILE")
+    return Path(named or os.path.join(os.path.expanduser("~"), ".aws", "credentials"))

@@ -6,8 +6,10 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
+import obstore
 import pytest
 from object_store import keys, machine, running_store, upload
+from obstore.store import from_url
 
 from fieldcal.batch.closing import close_night
 from fieldcal.batch.flights import one_flight
@@ -104,6 +106,8 @@ def test_nights_by_url_end_as_one_on_this_machine(
         assert len(night(archive_at(logs), Warehouse(url).root).plan.done) == 4
         is_whole(url, content)
     assert len(fetched) == 4
+    page = obstore.get(from_url(url), "site/index.html")
+    assert page.attributes["Content-Type"] == "text/html"
     assert {key.split("/")[0] for key in before} == {"heads", "objects", "tables", "night", "site", "reports"}
 
 

@@ -34,6 +34,7 @@ from fieldcal.warehouse.remote.garbage import garbage
 from fieldcal.warehouse.remote.heads import GRACE, Head
 from fieldcal.warehouse.remote.share import share
 from fieldcal.warehouse.remote.turn import in_turn
+from fieldcal.warehouse.sealed import seal
 from fieldcal.warehouse.signals import read_signal, signal_writer
 from fieldcal.warehouse.upkeep.prune import of_vehicle, remove
 from fieldcal.warehouse.upkeep.verify import verify
@@ -214,7 +215,7 @@ def test_an_object_that_was_cut_short_is_told(url: str, tmp_path: Path) -> None:
         assert [one["path"] for one in damaged] == [key]
 
 
-@pytest.mark.parametrize("head", [b"{}", b"", Head("other").encoded()])
+@pytest.mark.parametrize("head", [b"{}", b"", seal(Head("other").plain())])
 def test_a_head_that_is_none_is_told(url: str, tmp_path: Path, head: bytes) -> None:
     obstore.put(from_url(url), "heads/v.json", head)
     with machine(tmp_path), pytest.raises(WarehouseError, match=rf"{url}/heads/v.json is") as told:
@@ -269,6 +270,20 @@ def test_a_vehicle_that_is_removed_is_gone_for_all(url: str, tmp_path: Path) -> 
     with machine(tmp_path / "2"):
         assert flights(url) == ["b"]
     assert not [key for key in keys(url, "tables") if "vehicle=v" in key]
+
+
+def test_what_was_removed_from_a_copy_is_fetched_anew(url: str, tmp_path: Path) -> None:
+    with machine(tmp_path):
+        root = published(url, "v", "a")
+        path = root / "tables" / "calibration" / "vehicle=v" / "part.parquet"
+        data = bytearray(path.read_bytes())
+        data[100] ^= 1
+        path.write_bytes(bytes(data))
+        with pytest.raises(WarehouseError, match=f"Remove it: it is a copy of what lies at {url}"):
+            Warehouse(url).scan("calibration")
+        path.unlink()
+        assert Warehouse(url).scan("calibration").collect().height == 6
+        assert verify(root)["ok"]
 
 
 def test_where_nothing_was_published_there_is_no_warehouse(url: str, tmp_path: Path) -> None:

@@ -21,9 +21,9 @@ from fieldcal.warehouse.remote.known import (
     fetched,
     in_threads,
     know_head,
+    known,
     known_head,
     known_names,
-    known_tag,
     objects_of,
 )
 from fieldcal.warehouse.remote.signals import drop_replaced
@@ -52,9 +52,9 @@ def refresh(root: Path) -> bool:
     if objects is None:
         return False
     listed = {name: one.e_tag for one in objects.listed(HEADS) if one.key == head_key(name := name_of(one.key))}
-    known = {name: _tag_if_there(root, name) for name in known_names(root)}
+    followed = {name: _tag_if_there(root, name) for name in known_names(root)}
     ahead = {path.name for path in (root / "remote" / "ahead").glob("*")}
-    names = {name for name in listed.keys() | known.keys() if listed.get(name) != known.get(name)} | ahead
+    names = {name for name in listed.keys() | followed.keys() if listed.get(name) != followed.get(name)} | ahead
     if names:
         prepare(root)
         in_threads(partial(_follow, root, objects), sorted(names))
@@ -63,13 +63,14 @@ def refresh(root: Path) -> bool:
 
 def _tag_if_there(root: Path, name: str) -> str | None:
     """The tag of the head that the copy follows, while its files are there: any may be removed to be fetched anew."""
-    head = known_head(root, name)
-    files = {} if head is None else {_place(root, name, table): one.size for table, one in head.files.items()}
+    found = known(root, name)
+    if found is None:
+        return None
     try:
-        there = all(path.stat().st_size == size for path, size in files.items())
+        there = all(_place(root, name, table).stat().st_size == one.size for table, one in found[0].files.items())
     except OSError:
         return None
-    return known_tag(root, name) if there else None
+    return found[1] if there else None
 
 
 def _place(root: Path, name: str, table: str) -> Path:

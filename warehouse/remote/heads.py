@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import Any, cast
+from typing import Any
 from uuid import uuid4
 
+from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.remote.objects import Objects, Tag
 from fieldcal.remote.url import below
 from fieldcal.schemas import HISTORY_TABLES
 from fieldcal.warehouse.errors import WarehouseError
-from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
+from fieldcal.warehouse.sealed import BrokenSeal, unseal
 
 HEADS, OBJECTS, LIVE = "heads", "objects", "tables"
 GRACE = timedelta(days=7)
@@ -59,18 +60,23 @@ class Head:
         """Every object that is live."""
         return [*self.files.values(), *((self.signals,) if self.signals else ())]
 
-    def encoded(self) -> bytes:
-        """The object's content."""
-        return seal(
-            {
-                "vehicle_id": self.vehicle_id,
-                "generation": self.generation,
-                "written": self.written,
-                "files": {table: _plain(one) for table, one in self.files.items()},
-                "signals": None if self.signals is None else _plain(self.signals),
-                "former": dict(self.former),
-            }
-        )
+    def plain(self) -> dict[str, Json]:
+        """As plain JSON; `Head.of` is the head again."""
+        return {
+            "vehicle_id": self.vehicle_id,
+            "generation": self.generation,
+            "written": self.written,
+            "files": {table: [*astuple(one)] for table, one in self.files.items()},
+            "signals": None if self.signals is None else [*astuple(self.signals)],
+            "former": dict(self.former),
+        }
+
+    @classmethod
+    def of(cls, plain: Mapping[str, Any]) -> Head:
+        """From plain JSON; tables that a newer release has are passed over."""
+        files = {table: Kept(*one) for table, one in plain["files"].items() if table in HISTORY_TABLES}
+        signals = None if plain["signals"] is None else Kept(*plain["signals"])
+        return cls(plain["vehicle_id"], plain["generation"], plain["written"], files, signals, dict(plain["former"]))
 
 
 def head_key(name: str) -> str:
@@ -100,19 +106,7 @@ def read_head(objects: Objects, name: str, vehicle_id: str = "") -> tuple[Head, 
     if found is None:
         return Head(vehicle_id), None
     try:
-        return decoded(found[0]), found[1]
+        return Head.of(unseal(found[0])), found[1]
     except (BrokenSeal, KeyError, TypeError, ValueError, AttributeError) as error:
         told = f"{below(objects.url, head_key(name))} is damaged ({error}); restore an older version of that object."
         raise WarehouseError(ReasonCode.DAMAGED_FILE, told) from error
-
-
-def decoded(data: bytes) -> Head:
-    """The head from an object's content; tables that a newer release has are passed over."""
-    plain = cast(Mapping[str, Any], unseal(data))
-    files = {table: Kept(*one) for table, one in plain["files"].items() if table in HISTORY_TABLES}
-    signals = None if plain["signals"] is None else Kept(*plain["signals"])
-    return Head(plain["vehicle_id"], plain["generation"], plain["written"], files, signals, dict(plain["former"]))
-
-
-def _plain(one: Kept) -> list[str | int]:
-    return [one.key, one.sha256, one.size]

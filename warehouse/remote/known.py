@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.remote.cache import WAREHOUSES, origin
@@ -14,7 +14,7 @@ from fieldcal.remote.objects import Objects
 from fieldcal.remote.url import below
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.files import write_bytes
-from fieldcal.warehouse.remote.heads import HEADS, Head, Kept, decoded, name_of
+from fieldcal.warehouse.remote.heads import HEADS, Head, Kept, name_of
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 
 T = TypeVar("T")
@@ -36,12 +36,19 @@ def objects_of(root: Path) -> Objects | None:
     return None if found is None or found[0] != root else Objects(found[1])
 
 
-def known_head(root: Path, name: str) -> Head | None:
-    """The head that the copy follows; None of a vehicle that it knows nothing of."""
+def known(root: Path, name: str) -> tuple[Head, str] | None:
+    """The head that the copy follows, and its tag; None of a vehicle that it knows nothing of."""
     try:
-        return decoded(str(unseal(_place(root, name).read_bytes())["head"]).encode())
-    except (OSError, BrokenSeal, KeyError, ValueError):
+        told = unseal(_place(root, name).read_bytes())
+        return Head.of(cast(Mapping[str, Any], told["head"])), str(told["e_tag"])
+    except (OSError, BrokenSeal, KeyError, TypeError, ValueError):
         return None
+
+
+def known_head(root: Path, name: str) -> Head | None:
+    """The head alone."""
+    found = known(root, name)
+    return None if found is None else found[0]
 
 
 def known_names(root: Path) -> list[str]:
@@ -49,20 +56,12 @@ def known_names(root: Path) -> list[str]:
     return sorted(name_of(path.name) for path in (root / "remote" / HEADS).glob("*.json"))
 
 
-def known_tag(root: Path, name: str) -> str | None:
-    """The tag of the head that the copy follows."""
-    try:
-        return str(unseal(_place(root, name).read_bytes())["e_tag"])
-    except (OSError, BrokenSeal, KeyError):
-        return None
-
-
 def know_head(root: Path, name: str, head: Head, e_tag: str | None) -> None:
     """Remember the head that the copy follows; without a tag there is none."""
     if e_tag is None:
         _place(root, name).unlink(missing_ok=True)
     else:
-        write_bytes(_place(root, name), seal({"e_tag": e_tag, "head": head.encoded().decode()}), durable=False)
+        write_bytes(_place(root, name), seal({"e_tag": e_tag, "head": head.plain()}), durable=False)
 
 
 def fetched(objects: Objects, one: Kept) -> bytes:

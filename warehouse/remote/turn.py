@@ -20,6 +20,7 @@ from fieldcal.warehouse.remote.copy import begin_ahead, end_ahead, take_head
 from fieldcal.warehouse.remote.heads import Head, Kept, head_key, read_head
 from fieldcal.warehouse.remote.known import in_threads, know_head, objects_of
 from fieldcal.warehouse.remote.signals import with_own_signals
+from fieldcal.warehouse.sealed import seal
 
 T = TypeVar("T")
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.05, 2.0
@@ -82,7 +83,7 @@ def _committed(root: Path, objects: Objects, before: Head, tag: Tag | None, flig
         return True
     in_threads(partial(_put, objects), [*fresh, *own])
     head = before.next(files, signals)
-    e_tag = objects.swap(head_key(name), head.encoded(), tag)
+    e_tag = objects.swap(head_key(name), seal(head.plain()), tag)
     if e_tag is None:  # refused, or won by a try whose answer was lost
         now, its_tag = read_head(objects, name)
         if now.written != head.written or its_tag is None:
