@@ -89,6 +89,12 @@ def assure(root: Path, paths: Iterable[Path], *, strict: bool = False) -> None:
             raise WarehouseError(ReasonCode.DAMAGED_FILE, told)
 
 
+def assured(root: Path, path: Path) -> str:
+    """The sha256 of a file that holds what was written; raises as `assure`, strictly."""
+    assure(root, [path], strict=True)
+    return file_sha256(path)
+
+
 def _wrong(root: Path, path: Path, strict: bool) -> str | None:
     if not path.exists():
         return None

@@ -12,6 +12,7 @@ from fieldcal.config.configuration import Configuration
 from fieldcal.flight.job import Job, file_stamp
 from fieldcal.logs import LogFile, find_logs, flight_id, log_sha256
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.remote.cache import ARCHIVES, origin
 from fieldcal.remote.content import here
 from fieldcal.remote.url import RemoteError
 
@@ -37,8 +38,11 @@ def find_jobs(
     if session is not None:
         inside = session.resolve()
         logs = (log for log in logs if log.path.resolve().is_relative_to(inside))
-    with ThreadPoolExecutor(AT_ONCE) as threads:  # by URL each that is new is fetched
-        return list(threads.map(partial(_job, ledger=ledger or {}, elsewhere=elsewhere), logs))
+    job = partial(_job, ledger=ledger or {}, elsewhere=elsewhere)
+    if origin(ARCHIVES, archive) is None:
+        return [job(log) for log in logs]
+    with ThreadPoolExecutor(AT_ONCE) as threads:  # each that is new is fetched
+        return list(threads.map(job, logs))
 
 
 def _job(log: LogFile, ledger: Ledger, elsewhere: Callable[[LogFile], Hashed | None] | None) -> Job:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from fieldcal.schemas import FLIGHT_TABLES
-from fieldcal.trends.drift_table import update_drift
-from fieldcal.trends.pooled.table import update_pooled
 from fieldcal.warehouse.checksums import history_digest
 from fieldcal.warehouse.remote.copy import refresh
 
@@ -27,6 +25,9 @@ def update_trends(root: Path) -> set[str]:
     WarehouseError
         As `fieldcal.trends.drift_table.update_drift`.
     """
+    from fieldcal.trends.drift_table import update_drift  # regressions, which a night with nothing new does not need
+    from fieldcal.trends.pooled.table import update_pooled
+
     changed: set[str] = set()
     for _ in range(_MOST_ROUNDS):
         made_from = history_digest(root, INPUTS)

@@ -32,7 +32,7 @@ def with_own_signals(
     fresh: list[tuple[str, bytes | Path]] = []
     for flight in sorted(flights):
         for path in sorted((root / "signals").glob(f"*/{SIGNAL_PARTITION}{name}/{encode_id(flight)}.parquet")):
-            place, sha256 = f"{path.parent.parent.name}/{path.stem}", file_sha256(path)
+            place, sha256 = f"{path.parent.parent.name}/{path.stem}", checksums.assured(root, path)
             if place not in listing or listing[place].sha256 != sha256:
                 listing[place] = Kept.new(sha256, path.stat().st_size)
                 fresh.append((listing[place].key, path))

@@ -12,8 +12,8 @@ from typing import TypeVar
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.remote.objects import Objects, Tag
 from fieldcal.schemas import HISTORY_TABLES
+from fieldcal.warehouse import checksums
 from fieldcal.warehouse.errors import WarehouseError
-from fieldcal.warehouse.files import file_sha256
 from fieldcal.warehouse.layout import encode_id, history_path
 from fieldcal.warehouse.lock import vehicle_lock
 from fieldcal.warehouse.remote.copy import begin_ahead, end_ahead, take_head
@@ -72,7 +72,7 @@ def _committed(root: Path, objects: Objects, before: Head, tag: Tag | None, flig
         path = history_path(root, table, vehicle_id)
         if not path.exists():
             continue
-        sha256, was = file_sha256(path), before.files.get(table)
+        sha256, was = checksums.assured(root, path), before.files.get(table)
         if was is not None and was.sha256 == sha256:
             files[table] = was
         else:
