@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import datetime as dt
 import json
+import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Sequence
@@ -36,8 +37,8 @@ from fieldcal.simulation.experiment import Experiment, simulate
 from fieldcal.stages.joint.information import equations_of
 from fieldcal.stages.joint.information import table_of as rows_of_equations
 from fieldcal.stages.pipeline import run_flight
+from fieldcal.trends.pooled.memory import Memory
 from fieldcal.trends.pooled.table import table_of
-from fieldcal.trends.pooled.units import units_of_history
 from fieldcal.warehouse.store import empty_frame
 
 START = dt.datetime(2026, 1, 12, 8, 0, tzinfo=dt.UTC)
@@ -161,7 +162,7 @@ def flights(vehicles: int, count: int, jobs: int) -> None:
     began = time.perf_counter()
     information, calibration, truths = fleet(vehicles, count, jobs=jobs)
     print(f"{vehicles} vehicles, {count} flights each: {time.perf_counter() - began:.0f} s of stages")
-    table = table_of(list(units_of_history(information)))
+    table = table_of(information)
     print(
         "| constant | rows ok of flights | error ÷ sd | pooled ok of vehicles | error ÷ sd | median sd alone, pooled |"
     )
@@ -286,11 +287,23 @@ def cost(units: int, count: int) -> None:
             rows.append(led(own, vehicle, k, flight.session, unit.day[flight.session]))
     information = pl.concat(rows)
     print(f"{units} units, {count} flights each: {information.estimated_size() / 1e6:.0f} MB of rows")
+    with tempfile.TemporaryDirectory() as folder:
+        pooled_again("cold", information, Path(folder))
+        pooled_again("nothing new", information, Path(folder))
+        # The same flight once more, in the session after: of the unit that flew last, which is of those that tell.
+        last = information.filter(pl.col("flight_id") == information["flight_id"][-1])
+        new = last.with_columns(
+            flight_id=pl.lit("new"), session_id=pl.lit("new"), started_at=pl.col("started_at") + dt.timedelta(days=7)
+        )
+        pooled_again("one new flight", pl.concat([information, new]), Path(folder))
+
+
+def pooled_again(what: str, information: pl.DataFrame, folder: Path) -> None:
     began = time.perf_counter()
-    made = list(units_of_history(information))
-    read = time.perf_counter() - began
-    table = table_of(made)
-    print(f"units of rows {read:.1f} s, pooled {time.perf_counter() - began - read:.1f} s, {table.height} rows")
+    memory = Memory(folder, "")
+    table = table_of(information, memory)
+    memory.save()
+    print(f"{what}: {time.perf_counter() - began:.1f} s, {memory.pooled} units pooled, {table.height} rows")
 
 
 def real(archives: Sequence[Path], piece_s: float) -> None:
@@ -325,7 +338,7 @@ def real(archives: Sequence[Path], piece_s: float) -> None:
                 if "calibration" in tables:
                     ok = tables["calibration"].filter(parameter="scale", status="ok", method="joint")
                     alone += ok.filter(pl.col("axis").str.len_chars() == 1).height
-            table = table_of(list(units_of_history(pl.concat(rows)))) if len(rows) > 1 else empty_frame("pooled")
+            table = table_of(pl.concat(rows)) if len(rows) > 1 else empty_frame("pooled")
             cells = [f"{name}: {pieces} pieces, {alone} scales alone"]
             for sensor in (Sensor.GYROSCOPE, Sensor.ACCELEROMETER):
                 if (reference := truth_of(entry, sensor)) is None:

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from fieldcal.flows.server import Server, prepare_environment
+# Before NumPy is loaded, for processes that tests start too: two test processes whose linear algebra takes both cores
+# wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Studies that are run by hand have parts that are tested.
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -18,6 +20,8 @@ sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 @pytest.fixture(scope="session")
 def prefect_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of a server that is running, which fieldcal takes from the environment; started at the first use."""
+    from fieldcal.flows.server import Server, prepare_environment
+
     former = os.environ.pop("PREFECT_API_URL", None)
     prepare_environment(tmp_path_factory.mktemp("prefect"))
     with Server(Path(os.environ["PREFECT_HOME"])) as server:

@@ -154,7 +154,12 @@ class Warehouse(query.Warehouse):
         return drift_rows(self.root, vehicle, sensor, parameter)
 
     def pooled(
-        self, *, vehicle: str | None = None, sensor: str | None = None, parameter: str | None = None
+        self,
+        *,
+        vehicle: str | None = None,
+        sensor: str | None = None,
+        parameter: str | None = None,
+        at: datetime | None = None,
     ) -> pl.DataFrame:
         """What all flights of a unit know together, as the last night published it (table `pooled`).
 
@@ -165,8 +170,16 @@ class Warehouse(query.Warehouse):
         ----------
         vehicle, sensor, parameter : str, optional
             Only these.
+        at : datetime, optional
+            What the constants were at another moment (UTC, unless it has a time zone), by all flights before and after
+            it; at the last session else. Units whose flights have no dates have no rows then.
         """
-        return those_asked_for(existing(self.root), "pooled", vehicle, sensor, parameter).collect()
+        rows = those_asked_for(existing(self.root), "pooled", vehicle, sensor, parameter).collect()
+        if at is None:
+            return rows
+        from fieldcal.trends.pooled.table import table_then
+
+        return table_then(self.root, rows, at)
 
     def plan(self, vehicle: str) -> Plan:
         """Which half a minute of motion would tell most of a vehicle's constants, and the sd to expect after it.

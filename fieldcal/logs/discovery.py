@@ -109,6 +109,8 @@ def find_logs(archive: Path, logs_map: Iterable[LogsEntry] | None = None) -> lis
     found: dict[str, LogFile] = {}
     for entry in logs_map or ():
         for path in sorted(archive.glob(entry.glob)):
+            if not inside(path, root):  # a folder on the way may be a link
+                continue
             if path.suffix.lower() in TABLE_ENDS and not entry.glob.lower().endswith(path.suffix.lower()):
                 continue
             folders = path.relative_to(archive).parts[:-1] or (path.stem,)
@@ -129,7 +131,7 @@ def find_logs(archive: Path, logs_map: Iterable[LogsEntry] | None = None) -> lis
 
 
 def _add(found: dict[str, LogFile], archive: Path, root: Path, path: Path, vehicle: str, session: str) -> None:
-    if not inside(path, root) or not is_stored(path) or not named_in_text(path.relative_to(archive)):
+    if not stays_inside(path, root) or not is_stored(path) or not named_in_text(path.relative_to(archive)):
         return
     try:
         kind = log_format(path)
@@ -150,7 +152,7 @@ def _format_or_none(path: Path) -> str | None:
 
 
 def _folders(folder: Path, root: Path) -> Iterator[Path]:
-    return (path for path in entries(folder) if inside(path, root) and path.is_dir())
+    return (path for path in entries(folder) if stays_inside(path, root) and path.is_dir())
 
 
 def entries(folder: Path) -> list[Path]:
@@ -184,6 +186,14 @@ def inside(path: Path, root: Path) -> bool:
     try:
         return path.resolve(strict=True).is_relative_to(root)
     except (OSError, RuntimeError):
+        return False
+
+
+def stays_inside(path: Path, root: Path) -> bool:
+    """The same of a path whose folder is known to be inside: only a link leads out of it."""
+    try:
+        return inside(path, root) if path.is_symlink() else path.exists()
+    except OSError:  # in a folder that may not be entered
         return False
 
 

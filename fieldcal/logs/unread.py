@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 
-from fieldcal.logs.discovery import LOG_FORMATS, entries, inside, is_stored, named_in_text
+from fieldcal.logs.discovery import LOG_FORMATS, entries, is_stored, named_in_text, stays_inside
 
 BESIDE_LOGS = (
     "readme*",
@@ -85,7 +85,7 @@ def _walk(archive: Path, root: Path, log_uris: Collection[str]) -> Iterator[tupl
         level = [
             path
             for path in content
-            if inside(path, root)
+            if stays_inside(path, root)
             and path.is_dir()
             and _named(path)
             and path.relative_to(archive).as_posix() not in log_uris
@@ -97,7 +97,7 @@ def _named(path: Path) -> bool:
 
 
 def _reason(path: Path, root: Path, depth: int) -> str | None:
-    if not inside(path, root):
+    if not stays_inside(path, root):
         return OUTSIDE
     if not _named(path):
         return NO_TEXT

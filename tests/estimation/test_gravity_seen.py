@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fieldcal.estimation.gravity_seen import gravity_removed, gravity_seen
+from fieldcal.estimation import gravity_seen as module
+from fieldcal.estimation.gravity_seen import GravitySeen, gravity_removed, gravity_seen
 
 G = 9.8
 RATE_HZ, SECONDS = 100, 30
@@ -44,9 +45,10 @@ def test_readings_with_gravity_are_never_said_to_lack_it(signs: tuple[int, int, 
     assert gravity_removed(t, rate * np.array(signs), (force + BIAS) / unit, G) is None
 
 
-@pytest.mark.parametrize("left", [0.0, 0.05, 0.5])
+@pytest.mark.parametrize("left", [0.0, 0.05, 0.16, 0.5])
 def test_readings_without_gravity_are_told(left: float) -> None:
-    """A share of it may be left, as of an estimated attitude that is off; a bias is there too."""
+    """A share of it may be left, as of an estimated attitude that is off; a bias is there too. A sixth of it in m/s² is
+    1.6 times as long as gravity in g."""
     t, rate, force = flight()
     rng = np.random.default_rng(6)
     fault = gravity_removed(t, rate, left * force + BIAS + rng.normal(0, 0.3, force.shape), G)
@@ -71,3 +73,27 @@ def test_too_short_a_recording_tells_nothing() -> None:
     t, rate, force = flight()
     few = t < 9.9
     assert gravity_seen(t[few], rate[few], force[few]) is None
+
+
+@pytest.mark.parametrize(
+    ("mean", "turning", "told"),
+    [
+        (0.89, 0.0, True),
+        (0.91, 0.0, False),
+        (1.11, 0.0, False),
+        (1.12, 0.0, True),
+        (0.0, 0.69, True),
+        (0.0, 0.71, False),
+        (0.0, 1.42, False),
+        (0.0, 1.44, True),
+    ],
+)
+def test_what_is_gravity_in_g_is_not_gravity_taken_off(
+    monkeypatch: pytest.MonkeyPatch, mean: float, turning: float, told: bool
+) -> None:
+    """Shares of gravity that the readings would show if they were in g: a mean within a tenth of it, what turns within
+    three."""
+    g = 9.80665
+    monkeypatch.setattr(module, "gravity_seen", lambda *_: GravitySeen(mean * G / g, turning * G / g))
+    t, rate, force = flight()
+    assert (gravity_removed(t, rate, 0.1 * force, G) is not None) == told

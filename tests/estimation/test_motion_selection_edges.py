@@ -9,7 +9,7 @@ import pytest
 
 from fieldcal.config.parameters import Parameters
 from fieldcal.estimation import motion_selection
-from fieldcal.estimation.motion_selection import contiguous, select, windowed_rate
+from fieldcal.estimation.motion_selection import contiguous, select, turned_within, windowed_rate
 
 STEP_S = 0.01
 STAMPS = np.arange(0.0, 800.0, STEP_S)
@@ -47,6 +47,17 @@ def test_windowed_rate_is_the_rms_of_short_means() -> None:
     assert noise == pytest.approx(np.sqrt(np.sum(sigma**2) / 5))
     assert windowed_rate(t, rate, 0.5, smooth_s=0.02)[1] == pytest.approx(np.sqrt(np.sum(sigma**2)))
     assert windowed_rate(t, rate, 0.5, smooth_s=0.0)[1] == pytest.approx(np.sqrt(np.sum(sigma**2)))
+    alone, _ = windowed_rate(t, rate, 0.01, smooth_s=0.01)
+    np.testing.assert_allclose(alone, np.linalg.norm(centred, axis=1), rtol=1e-9)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_turn_is_measured_across_the_halves_of_a_window(way: float) -> None:
+    """.1 rad/s from 3 to 13 s: .2, .5 and .3 rad in halves of 5 s; .8 within the 10 s from the second half on."""
+    rate = turning((3.0, 13.0, 0.1 * way))
+    np.testing.assert_allclose(turned_within(STAMPS, rate), [0.8, 0.0, 0.0], atol=2e-3)
+    there_and_back = turning((3.0, 8.0, 0.1 * way), (8.0, 13.0, -0.1 * way))
+    np.testing.assert_allclose(turned_within(STAMPS, there_and_back), [0.5, 0.0, 0.0], atol=2e-3)
 
 
 def test_pads_of_five_seconds_and_rest_of_a_minute() -> None:

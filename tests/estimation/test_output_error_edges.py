@@ -133,6 +133,13 @@ def test_a_stretch_needs_more_than_half_the_blocks(short: int, told: bool) -> No
     assert (found > 0.0) == told
 
 
+def test_a_short_stretch_is_looked_at_row_by_row() -> None:
+    """Of 13 rows, steps of one: six rows apart differ by 6, neighbours by 1."""
+    residual = np.arange(13.0)[:, None] * np.ones(3)
+    found, _ = random_walk(np.arange(13.0) * 0.5, residual, np.zeros(13), np.ones(13))
+    assert found == pytest.approx((36.0 - 1.0) / (5 * 0.5))
+
+
 def test_nothing_to_compare_is_no_walk() -> None:
     rng = np.random.default_rng(3)
     assert random_walk(np.arange(6.0), rng.normal(size=(6, 3)), np.zeros(6), np.ones(6)) == (0.0, 0.0)

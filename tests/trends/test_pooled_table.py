@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 from pathlib import Path
 from typing import Any
@@ -177,6 +178,35 @@ def test_each_flight_s_share_is_told(fleet: tuple[Path, list[Truth]], capsys: py
     share = {k: np.mean([r["share"] for r in rows if r["flight_id"].endswith(f"{k}")]) for k in range(SESSIONS)}
     assert min(share[k] for k in ALONE) > max(share[k] for k in share if k not in ALONE)
     assert not any(r["left_out"] for r in rows)
+
+
+def test_any_moment_can_be_asked_for(fleet: tuple[Path, list[Truth]]) -> None:
+    """At the last session it is the table; at every session the truth of then, by its sd; between two, less is known;
+    before the first, less and less."""
+    root, truths = fleet
+    warehouse = fieldcal.Warehouse(root)
+    now, day = warehouse.pooled(vehicle="v0"), truths[0].day
+    start = now["started_at"][0] - dt.timedelta(days=float(day[-1]))
+    z, sd = [], []
+    for at in (*day, 0.5 * (day[3] + day[4]), day[0] - 100.0):
+        then = warehouse.pooled(vehicle="v0", at=start + dt.timedelta(days=float(at)))
+        assert then.select("sensor", "parameter", "axis").equals(now.select("sensor", "parameter", "axis"))
+        sd.append(then["sd"].to_numpy())
+        if at not in day:
+            continue
+        truth = truths[0].walked[int(np.flatnonzero(day == at)[0])]
+        for row in then.iter_rows(named=True):
+            name = row["sensor"], "gain" if row["parameter"] == "scale" else "zero", row["axis"]
+            value = truth[NAMES.index(name)]
+            expected = 1.0 / value if row["parameter"] == "scale" else value
+            z.append((row["value_at_25degc"] - expected) / row["sd"])
+    assert warehouse.pooled(vehicle="v0", at=now["started_at"][0])["value_at_25degc"].to_list() == pytest.approx(
+        now["value_at_25degc"].to_list()
+    )
+    assert np.abs(z).max() < 4.5
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.5
+    assert (sd[-2] >= np.minimum(sd[3], sd[4])).all()
+    assert (sd[-1] > sd[0]).all()
 
 
 def test_a_withdrawn_flight_counts_no_more(fleet: tuple[Path, list[Truth]], tmp_path: Path) -> None:

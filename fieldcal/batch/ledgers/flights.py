@@ -56,7 +56,8 @@ class Ledger:
             self._histories = cast(Mapping[str, str], found["histories"])
         except (OSError, BrokenSeal, KeyError):
             pass
-        self._common = _common()
+        self._common = _common(configuration)
+        self._vehicles: dict[str, str] = {}
         self._same_history: dict[str, bool] = {}
 
     def entry(self, job: Job) -> LogEntry | None:
@@ -96,17 +97,24 @@ class Ledger:
             return None
         files = sorted(_files(self._root, job, records))
         entry: LogEntry = {**outcome.entry(), "stages_run": 0, "stages_cached": len(records), "ran": {}}
-        of = _of(job.plain(), self._configuration, self._common)
+        of = self._of(job.plain())
         return {"of": of, "files": files, "as_they_were": _stamps(self._root, files), "entry": entry}
 
+    def _of(self, job: PlainJob) -> str:
+        """Digest of what a flight's results, and what is said of it, follow from."""
+        vehicle_id = job["vehicle_id"]
+        if (vehicle := self._vehicles.get(vehicle_id)) is None:
+            vehicle = self._vehicles[vehicle_id] = self._configuration.vehicle(vehicle_id).model_dump_json()
+        return _digest([job, vehicle, self._common])
+
     def _is_as_it_was(self, job: Job, known: Seen) -> bool:
-        if known["of"] != _of(job.plain(), self._configuration, self._common):
+        if known["of"] != self._of(job.plain()):
             return False
         return self._history_is_same(job.vehicle_id) and _stamps(self._root, known["files"]) == known["as_they_were"]
 
     def _of_content(self, job: Job) -> str:
         """What its results follow from wherever its log lies."""
-        return _of({**job.plain(), "path": "", "stamp": []}, self._configuration, self._common)
+        return self._of({**job.plain(), "path": "", "stamp": []})
 
     def _history_is_same(self, vehicle_id: str) -> bool:
         if vehicle_id not in self._same_history:
@@ -115,15 +123,12 @@ class Ledger:
         return self._same_history[vehicle_id]
 
 
-def _common() -> str:
+def _common(configuration: Configuration) -> str:
     """Digest of what every flight's results follow from."""
-    return json.dumps([dict(sources()), versions(), library_versions()], sort_keys=True)
+    return _digest([dict(sources()), versions(), library_versions(), configuration.limits.model_dump_json()])
 
 
-def _of(job: PlainJob, configuration: Configuration, common: str) -> str:
-    """Digest of what a flight's results, and what is said of it, follow from."""
-    vehicle, limits = configuration.vehicle(job["vehicle_id"]), configuration.limits
-    parts = (job, vehicle.model_dump_json(), limits.model_dump_json(), common)
+def _digest(parts: object) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 

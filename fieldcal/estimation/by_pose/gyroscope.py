@@ -127,10 +127,11 @@ def fit_gyroscope(
 
 def _trusted(free: JointFit, stiff: JointFit) -> JointFit:
     """The free fit is the more exact where its noise model holds: it then claims less and agrees with the stiff one
-    (Hausman, 1978)."""
+    (Hausman, 1978). Claims are compared by the volume of the scales' covariance: of three sd one is larger by chance
+    in one flight of four."""
     (scale, _, covariance), (other, _, larger) = (fit.constants("gyroscope") for fit in (free, stiff))
     difference = scale - other
-    claims_less = bool(np.all(np.diagonal(covariance)[:3] < np.diagonal(larger)[:3]))
+    claims_less = bool(np.linalg.det(covariance[:3, :3]) < np.linalg.det(larger[:3, :3]))
     agrees = float(difference @ np.linalg.solve(larger[:3, :3], difference)) < AGREEMENT_CHI2
     return free if claims_less and agrees else stiff
 

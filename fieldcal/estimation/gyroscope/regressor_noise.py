@@ -41,7 +41,7 @@ def smoothed_noise_variance(
     interval = float(np.median(np.diff(stamps)))
     length = round(BLOCK_S / interval)
     low, high = BAND[0] * cutoff_hz, min(BAND[1] * cutoff_hz, 0.5 * HIGHEST / interval)
-    if cutoff_hz <= 0.0 or length < 2:
+    if cutoff_hz <= 0.0 or not length:
         return none
     frequency = np.fft.rfftfreq(length, interval)
     band = (frequency >= low) & (frequency <= high)

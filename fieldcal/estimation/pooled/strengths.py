@@ -24,7 +24,9 @@ FEW = 4.0
 EXPECTED_SHARE = 0.5
 RISE = 0.3
 """Of minus twice the logarithm of the likelihood that a strength is still likely at: half a standard deviation."""
-TOLERANCES = {"fatol": 0.05, "xatol": 0.1}
+TOLERANCES = {"fatol": 1e-4, "xatol": 1e-3}
+GRID = 1.25
+"""Ratio of neighbouring variances that are told apart."""
 START = 0.2, 0.4, 0.5
 """Sd of walk, scatter and slope over that of a session itself, from where the likeliest are looked for."""
 
@@ -39,6 +41,12 @@ class Strengths:
     slope: float
     freedom: float = 1e6
     """Innovations that they were estimated from: so uncertain is what is divided by them."""
+
+    def coarse(self) -> Strengths:
+        """Each on a grid of `GRID`, which is finer than it is known: a flight more then leaves nearly all as they
+        are, and with them every unit that did not fly."""
+        walk, scatter, slope, freedom = map(_on_grid, (self.walk, self.scatter, self.slope, self.freedom))
+        return Strengths(walk, scatter, slope, float(round(freedom)))
 
 
 @dataclass(frozen=True)
@@ -137,6 +145,10 @@ def strengths_of(series: Series, *, with_slope: bool = True) -> Strengths:
     return replace(found, freedom=FEW + float(np.isfinite(innovations(series, found)[0]).sum()))
 
 
+def _on_grid(value: float) -> float:
+    return float(GRID ** np.round(np.log(value) / np.log(GRID))) if value > 0.0 else 0.0
+
+
 def _unlikely(ratio: float) -> float:
     """Minus twice the logarithm of the chance of a variance beforehand, over that of a session itself."""
     return float(FEW * (np.log(ratio) + EXPECTED_SHARE**2 / ratio))
@@ -152,4 +164,4 @@ def _largest_likely(cost: Callable[[Array], float], best: Array, least: float, i
         x[i] = value
         return cost(x) - least - RISE
 
-    return float(brentq(rise, low, high, xtol=0.05)) if rise(high) > 0.0 else low
+    return float(brentq(rise, low, high, xtol=1e-3)) if rise(high) > 0.0 else low

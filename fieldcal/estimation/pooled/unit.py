@@ -280,7 +280,7 @@ def jumps(past: Known, future: Known) -> tuple[Array, Array]:
 
 def strengths(units: Sequence[Unit], *, rounds: int = 2) -> dict[tuple[str, str], Strengths]:
     """How much each kind of constant moves, of all units: what sessions say of a constant, given what the others say
-    of all others, is a series of `strengths_of`."""
+    of all others, is a series of `strengths_of`. Coarse (`Strengths.coarse`)."""
     kinds = _first_strengths(units)
     for _ in range(rounds):
         rows: dict[tuple[str, str], list[Array]] = {kind: [] for kind in kinds}
@@ -292,7 +292,7 @@ def strengths(units: Sequence[Unit], *, rounds: int = 2) -> dict[tuple[str, str]
             kind: strengths_of(Series.of([one for one in own if len(one)]), with_slope=kind[1] in SLOPED)
             for kind, own in rows.items()
         }
-    return kinds
+    return {kind: strengths.coarse() for kind, strengths in kinds.items()}
 
 
 def _first_strengths(units: Sequence[Unit]) -> dict[tuple[str, str], Strengths]:

@@ -18,8 +18,7 @@ from fieldcal.estimation.joint.ladder import fit_with_fallbacks
 from fieldcal.estimation.joint.problem import PriorConstants, Readings
 from fieldcal.estimation.normal_equations import NormalEquations
 from fieldcal.estimation.pooled.chain import Estimate, Known
-from fieldcal.estimation.pooled.strengths import Strengths
-from fieldcal.estimation.pooled.unit import Flight, Kinds, Pooled, state_of
+from fieldcal.estimation.pooled.unit import Flight, Pooled, state_of
 from fieldcal.flight.threads import one_thread
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array
@@ -29,9 +28,9 @@ from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.simulation.experiment import Experiment, simulate
 from fieldcal.stages.composition import ORIGIN
 from fieldcal.stages.tables import AXES
-from fieldcal.trends.pooled.rows import limit_of, words_of
+from fieldcal.trends.pooled.rows import limit_of, strengths_told, words_of
 from fieldcal.trends.pooled.table import information_that_counts, near
-from fieldcal.trends.pooled.units import HistoryUnit, units_of_history
+from fieldcal.trends.pooled.units import HistoryUnit, by_unit, unit_of
 from fieldcal.warehouse.questions import existing, known_vehicle
 
 SECONDS, TURN_RAD = 30.0, np.pi / 3
@@ -108,32 +107,15 @@ def plan(root: Path, vehicle_id: str) -> Plan:
         )
     now = table.sort("started_at", "flight_id", nulls_last=False)["pooled_with"][-1]
     rows = information_that_counts(root).filter(pl.col("unit_id") == now)
-    (one,) = units_of_history(rows)
+    one = unit_of(by_unit(rows)[0])
     with one_thread():
-        found = near(one, _kinds(table.filter(pl.col("pooled_with") == now), one))
+        found = near(one, strengths_told(table.filter(pl.col("pooled_with") == now), one))
         axes = _axes(warehouse.scan("run", vehicle_id=vehicle_id))
         dip_rad = _dip(warehouse.scan("calibration", vehicle_id=vehicle_id))
         about = [turned for n in (1, 2, 3) for turned in combinations(range(3), n)]
         made = [_manoeuvre(one, found, turned, axes, dip_rad) for turned in about]
     order = sorted((m for m in made if m is not None), key=lambda m: (m.refused_after, -m.gain))
     return Plan(vehicle_id, str(now), tuple(order))
-
-
-def _kinds(table: pl.DataFrame, one: HistoryUnit) -> Kinds:
-    """The strengths that the table was made with."""
-    kinds: dict[tuple[str, str], Strengths] = {}
-    for row in table.iter_rows(named=True):
-        parameter = "gain" if row["parameter"] == "scale" else row["parameter"]
-        if row["session_sd"] is None or (row["sensor"], parameter) in kinds:
-            continue
-        size = one.per[row["sensor"], parameter, row["axis"]] * (
-            row["value_at_25degc"] ** 2 if parameter == "gain" else 1.0
-        )
-        walk, scatter, slope = (
-            ((row[c] or 0.0) / size) ** 2 for c in ("walk_per_sqrt_day", "session_sd", "slope_spread")
-        )
-        kinds[row["sensor"], parameter] = Strengths(walk, scatter, slope, row["n_innovations"])
-    return {name[:2]: kinds.get(name[:2], Strengths(0.0, 0.0, 0.0)) for name in one.unit.names}
 
 
 def _axes(runs: pl.LazyFrame) -> Array:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from datetime import datetime, timedelta
 
 import numpy as np
+import polars as pl
 
 from fieldcal.config.parameters import Parameters
 from fieldcal.estimation.normal_equations import Name
 from fieldcal.estimation.pooled.chain import Estimate
+from fieldcal.estimation.pooled.strengths import Strengths
 from fieldcal.estimation.pooled.unit import Kinds, Pooled
 from fieldcal.geometry.earth_field import UNIT_IN_TESLA
 from fieldcal.geometry.rotation import Array
@@ -27,11 +29,12 @@ TILT = "Turn it over, so that the sensor's {axis} axis points up, down and level
 Row = dict[str, object]
 
 
-def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds) -> list[Row]:
-    """Rows of each constant; of a unit whose flights say nothing none."""
+def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds, day: float | None = None) -> list[Row]:
+    """Rows of each constant, at the last session unless a `day` since EPOCH is given; of a unit whose flights say
+    nothing none."""
     if not any(own.information.any() for own in found.raw):
         return []
-    now = found.at()
+    now = found.at(day)
     out = {left.flight for left in found.left_out}
     sessions = {flight.session for k, flight in enumerate(found.unit.flights) if k not in out}
     unconfirmed = bool(out) and len(found.unit.day) - 1 not in sessions
@@ -95,6 +98,23 @@ def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds) -> list[Row]:
         }
         rows.append(own)
     return rows
+
+
+def strengths_told(table: pl.DataFrame, one: HistoryUnit) -> Kinds:
+    """The strengths that a unit's rows of the table were made with."""
+    kinds: dict[tuple[str, str], Strengths] = {}
+    for row in table.iter_rows(named=True):
+        parameter = "gain" if row["parameter"] == "scale" else row["parameter"]
+        if row["session_sd"] is None or (row["sensor"], parameter) in kinds:
+            continue
+        size = one.per[row["sensor"], parameter, row["axis"]] * (
+            row["value_at_25degc"] ** 2 if parameter == "gain" else 1.0
+        )
+        walk, scatter, slope = (
+            ((row[c] or 0.0) / size) ** 2 for c in ("walk_per_sqrt_day", "session_sd", "slope_spread")
+        )
+        kinds[row["sensor"], parameter] = Strengths(walk, scatter, slope, row["n_innovations"])
+    return {name[:2]: kinds.get(name[:2], Strengths(0.0, 0.0, 0.0)) for name in one.unit.names}
 
 
 def _parameter(name: Name) -> str:

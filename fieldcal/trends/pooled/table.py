@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +13,11 @@ import polars as pl
 
 from fieldcal.estimation.pooled.unit import Kinds, Pooled, Unit, pool, strengths
 from fieldcal.flight.threads import one_thread
+from fieldcal.provenance.run_key import run_key, source_digest
 from fieldcal.schemas import TABLES, table_key
-from fieldcal.trends.pooled.rows import rows_of_unit
-from fieldcal.trends.pooled.units import HistoryUnit, units_of_history
+from fieldcal.trends.pooled.memory import Memory
+from fieldcal.trends.pooled.rows import rows_of_unit, strengths_told
+from fieldcal.trends.pooled.units import DAY, EPOCH, HistoryUnit, by_unit, sessions_flown, unit_of
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.decisions.withdrawn import counting
 from fieldcal.warehouse.layout import history_files
@@ -33,8 +37,11 @@ INFORMED = 1e-6
 def update_pooled(root: Path) -> tuple[str, ...]:
     """Publish what is pooled under the vehicle that each unit flew on last; the vehicles whose table changed.
 
-    A function of the history alone; no log is read. Raises as `fieldcal.warehouse.publish.publish`."""
-    table = pooled_table(root)
+    A function of the history alone; no log is read, and units of which nothing changed are not pooled again (`memory`).
+    Raises as `fieldcal.warehouse.publish.publish`."""
+    memory = Memory(root, run_key("pooled", source_digest(kinds_of, rows_of), {}, {}))
+    table = pooled_table(root, memory)
+    memory.save()
     there: set[str] = set()
     for path in history_files(root, "pooled"):
         there |= set(read_table(path, "pooled")["vehicle_id"].to_list())
@@ -45,9 +52,9 @@ def update_pooled(root: Path) -> tuple[str, ...]:
     )
 
 
-def pooled_table(root: Path) -> pl.DataFrame:
+def pooled_table(root: Path, memory: Memory | None = None) -> pl.DataFrame:
     """The table `pooled` as the history has it now; nothing is written."""
-    return table_of(list(units_of_history(information_that_counts(root))))
+    return table_of(information_that_counts(root), memory)
 
 
 def information_that_counts(root: Path) -> pl.DataFrame:
@@ -55,28 +62,53 @@ def information_that_counts(root: Path) -> pl.DataFrame:
     return Warehouse(root).scan("information").filter(counting(root)).collect()
 
 
-def table_of(units: Sequence[HistoryUnit]) -> pl.DataFrame:
-    """The table `pooled` of these units, which are the fleet."""
+def table_of(information: pl.DataFrame, memory: Memory | None = None) -> pl.DataFrame:
+    """The table `pooled` of the fleet whose rows of `information` these are."""
+    memory, units = memory or Memory(), by_unit(information)
     if not units:
         return empty_frame("pooled")
+    # By powers of two, so that the next flight of one does not make others tell.
+    telling = sorted(units, key=lambda unit: -sessions_flown(unit).bit_length())[:MOST_UNITS]
     with one_thread():
-        kinds = kinds_of([one.unit for one in units])
-        rows = [row for one in units for row in rows_of_unit(one, near(one, kinds), kinds)]
-    if not rows:
-        return empty_frame("pooled")
-    table = pl.DataFrame(rows, schema=empty_frame("pooled").schema)
+        kinds = memory.kinds(telling, lambda: kinds_of(telling))
+        rows = [memory.rows(unit, kinds, partial(rows_of, unit, kinds)) for unit in units]
     # A magnetometer that flew with two IMUs is what its last flight's says.
     return (
-        table.sort("started_at", "flight_id", nulls_last=False)
+        pl.concat(rows)
+        .sort("started_at", "flight_id", nulls_last=False)
         .unique(KEY, keep="last")
         .sort(KEY)
         .select(TABLES["pooled"].column_names)
     )
 
 
-def kinds_of(units: Sequence[Unit]) -> Kinds:
-    """How much each kind of constant moves, by the units with most sessions."""
-    return strengths(sorted(units, key=lambda unit: -len(unit.day))[:MOST_UNITS])
+def table_then(root: Path, table: pl.DataFrame, moment: datetime) -> pl.DataFrame:
+    """What rows of the table `pooled` were at another moment, by all flights before and after it; nothing is written.
+
+    Rows of units that no flight of which has a date are left out: nobody knows what they were when."""
+    day = ((moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - EPOCH) / DAY
+    information = information_that_counts(root)
+    out = [empty_frame("pooled")]
+    for (unit_id,), own in table.group_by("pooled_with", maintain_order=True):
+        one = unit_of(by_unit(information.filter(pl.col("unit_id") == unit_id))[0])
+        if one.last["started_at"] is None:
+            continue
+        kinds = strengths_told(own, one)
+        with one_thread():
+            rows = pl.DataFrame(rows_of_unit(one, near(one, kinds), kinds, day), schema=out[0].schema)
+        out.append(rows.join(own.select(KEY), on=KEY, how="semi"))
+    return pl.concat(out).sort(KEY)
+
+
+def kinds_of(units: Sequence[pl.DataFrame]) -> Kinds:
+    """How much each kind of constant moves, by the units of these rows of `information`."""
+    return strengths([unit_of(rows).unit for rows in units])
+
+
+def rows_of(unit: pl.DataFrame, kinds: Kinds) -> pl.DataFrame:
+    """Rows of the table `pooled`, of the unit of these rows of `information`."""
+    one = unit_of(unit)
+    return pl.DataFrame(rows_of_unit(one, near(one, kinds), kinds), schema=empty_frame("pooled").schema)
 
 
 def near(one: HistoryUnit, kinds: Kinds) -> Pooled:

@@ -3,7 +3,7 @@ time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
@@ -44,24 +44,30 @@ class HistoryUnit:
     temperatures_degc: tuple[float, float] | None
 
 
-def units_of_history(rows: pl.DataFrame) -> Iterator[HistoryUnit]:
-    """Units with flights enough of `information`'s rows, in order of their ids."""
-    for _, own in rows.sort("unit_id", *FLOWN_ORDER, "place", nulls_last=False).group_by(
-        "unit_id", maintain_order=True
-    ):
+def by_unit(rows: pl.DataFrame) -> list[pl.DataFrame]:
+    """`information`'s rows of each unit with flights enough, in the order of their ids; flights in the order of time,
+    only those whose time is known where there are any."""
+    ordered = rows.sort("unit_id", *FLOWN_ORDER, "place", nulls_last=False)
+    units = []
+    for own in ordered.partition_by("unit_id", maintain_order=True):
         dated = own.filter(pl.col("started_at").is_not_null())
-        unit = _unit(dated if dated.height else own)
-        if unit is not None:
-            yield unit
+        flown = dated if dated.height else own
+        if flown["flight_id"].n_unique() >= FEWEST_FLIGHTS:
+            units.append(flown)
+    return units
 
 
-def _unit(rows: pl.DataFrame) -> HistoryUnit | None:
+def sessions_flown(rows: pl.DataFrame) -> int:
+    """In how many sessions a unit flew."""
+    return rows.select("vehicle_id", "session_id").n_unique()
+
+
+def unit_of(rows: pl.DataFrame) -> HistoryUnit:
+    """A unit as it is pooled, of one of the frames of `by_unit`."""
     grouped: dict[str, list[InformationRow]] = {}
     for row in typed(rows.iter_rows(named=True), InformationRow):
         grouped.setdefault(row["flight_id"], []).append(row)
     flights = list(grouped.values())
-    if len(flights) < FEWEST_FLIGHTS:
-        return None
     # A sensor is that of the last flight: one of another id, or logged in another unit, is eliminated.
     ids = {row["sensor"]: row["sensor_unit_id"] for own in flights for row in own}
     zero_units = {row["sensor"]: row["unit"] for own in flights for row in own if row["parameter"] == "zero"}

@@ -72,6 +72,19 @@ def test_a_spoiled_flight_is_left_out(flight: int) -> None:
     assert not found.contributions()[flight].any()
 
 
+def test_a_fifth_of_the_flights_may_be_left_out() -> None:
+    unit = drawn(np.random.default_rng(2), 10, seen=12)
+    assert {one.flight for one in pool(spoiled(spoiled(unit, 2), 8), KNOWN).left_out} == {2, 8}
+    three = pool(spoiled(spoiled(spoiled(unit, 2), 5), 8), KNOWN)
+    assert len(three.left_out) == 2
+
+
+@pytest.mark.parametrize(("sessions", "told"), [(2, False), (3, True)])
+def test_of_two_that_contradict_each_other_neither_is_left_out(sessions: int, told: bool) -> None:
+    unit = spoiled(drawn(np.random.default_rng(2), sessions, seen=40), 0)
+    assert [one.flight for one in pool(unit, KNOWN).left_out] == [0] * told
+
+
 def test_a_parallel_shift_of_the_reference_point_changes_nothing() -> None:
     unit = drawn(np.random.default_rng(3), SESSIONS, seen=4)
     moved = [
@@ -148,3 +161,26 @@ def test_units_without_a_fault_are_told_of_none() -> None:
     """A thinned run of `benchmarks/pooled.py alarms`."""
     ((wrong, _, hits),) = alarms(1, counts=(8,)).values()
     assert (wrong, hits) == (0, 1)
+
+
+def test_a_series_that_starts_anew_keeps_its_slope() -> None:
+    """Of one a degree, then a step at 5 °C: at −5 °C the value is ten less than after the step."""
+    warmth = np.array([-10.0, 10.0, -10.0, 10.0, 5.0, -5.0])
+    value = warmth + np.array([0.0, 0.0, 0.0, 0.0, 100.0, 100.0])
+    series = Series.of([np.column_stack([np.arange(6.0), warmth, value, np.full(6, 1e-4)])])
+    z, variance = innovations(series, Strengths(0.0, 1e-4, 4.0))
+    assert np.isnan(z[[0, 4], 0]).all()
+    assert abs(z[5, 0]) < 0.1
+    assert variance[5, 0] < 1e-3
+
+
+def test_strengths_are_told_apart_by_a_quarter() -> None:
+    """Nothing stays nothing; a thousandth more is the same; a half more is not."""
+    coarse = Strengths(0.0, 3e-7, 2e-3, 1084.0).coarse()
+    assert coarse.walk == 0.0
+    assert coarse.scatter == pytest.approx(3e-7, rel=0.12)
+    assert coarse.slope == pytest.approx(2e-3, rel=0.12)
+    assert coarse.freedom == round(1.25**31)
+    assert Strengths(0.0, 3.003e-7, 2.002e-3, 1085.0).coarse() == coarse
+    assert Strengths(0.0, 4.5e-7, 2e-3, 1084.0).coarse().scatter > 1.2 * coarse.scatter
+    assert coarse.coarse() == coarse
