@@ -23,6 +23,7 @@ from fieldcal.geometry import sensor_model
 from fieldcal.logs.on_board import PRIMARY
 from fieldcal.names import SENSORS, Approach, Json, exactness
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.remote.places import log_at
 from fieldcal.schemas.rows import FlightDocument, Refusable, SyncRow
 from fieldcal.stages.composition import ORIGIN, in_log
 from fieldcal.stages.tables import matrix, seconds
@@ -392,7 +393,7 @@ def calibrate(
         own = as_recording(log, config, vehicle).source
         wanted = overruled(own.vehicle, profile=profile, method=method, changes=changes)
         return _calibration(replace(own, vehicle=wanted), unit)
-    job, configured = identify(Path(log), None if config is None else Path(config), vehicle_id=vehicle)
+    job, configured = identify(log_at(log), None if config is None else Path(config), vehicle_id=vehicle)
     return _calibration(read(job, overruled(configured, profile=profile, method=method, changes=changes)), unit)
 
 

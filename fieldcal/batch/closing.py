@@ -8,11 +8,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from fieldcal.batch.sources import TRENDS, sources
+from fieldcal.batch.trends import INPUTS, update_trends
 from fieldcal.provenance.run_key import run_key
 from fieldcal.report.fitness import Criteria, fleet_fitness
 from fieldcal.report.standing.memory import remember, remembered, remembered_fleet
 from fieldcal.report.standing.news import Change, news
-from fieldcal.schemas import FLEET_TABLES, FLIGHT_TABLES, HISTORY_TABLES, TABLES
+from fieldcal.schemas import FLEET_TABLES, HISTORY_TABLES, TABLES
 from fieldcal.schemas.arrow import VERSION_KEY
 from fieldcal.warehouse.checksums import assure, history_digest
 from fieldcal.warehouse.decisions.withdrawn import decisions
@@ -20,10 +21,11 @@ from fieldcal.warehouse.errors import disk
 from fieldcal.warehouse.layout import history_files
 from fieldcal.warehouse.lock import fleet_lock
 from fieldcal.warehouse.publish import settle
+from fieldcal.warehouse.remote.copy import refresh
+from fieldcal.warehouse.remote.share import share
 from fieldcal.warehouse.store import read_facts
 from fieldcal.warehouse.upkeep.verify import night_files
 
-INPUTS = (*FLIGHT_TABLES, "decision")
 MOST_PAGES = 10
 
 
@@ -53,6 +55,7 @@ def close_night(root: Path, criteria: Criteria, *, with_site: bool = True) -> Cl
     """
     now = datetime.now(UTC)
     with fleet_lock(root):
+        refresh(root)
         assure(root, [path for table in HISTORY_TABLES for path in history_files(root, table)], strict=True)
         _forget_damaged(root)
         before = remembered(root)
@@ -61,11 +64,8 @@ def close_night(root: Path, criteria: Criteria, *, with_site: bool = True) -> Cl
             settle(root, vehicle_id)  # where deciding was interrupted, rows do not follow yet
         made_from = _made_from(root)
         if before.get("made_from") != made_from or before.get("made") != history_digest(root, FLEET_TABLES):
-            from fieldcal.trends.drift_table import update_drift
-            from fieldcal.trends.pooled.table import update_pooled
-
-            update_drift(root)
-            update_pooled(root)
+            update_trends(root)
+            made_from = _made_from(root)
         from fieldcal.site.snapshot import Snapshot
         from fieldcal.site.write import write_pages
 
@@ -76,6 +76,7 @@ def close_night(root: Path, criteria: Criteria, *, with_site: bool = True) -> Cl
         site = write_pages(snapshot, fleet) if with_site else None
         made = history_digest(root, FLEET_TABLES)
         remember(root, fleet, criteria, {"made_from": made_from, "made": made})
+        share(root)
         return Closing(told, report, site)
 
 

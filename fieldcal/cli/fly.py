@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 import fieldcal
-from fieldcal.cli.options import AsJson, Config, Output, Root, UnusedConfig, Whole, Wide
+from fieldcal.cli.options import AsJson, Config, Output, Place, Root, UnusedConfig, Whole, Wide
 from fieldcal.reason_codes import ReasonCode
 
 Format = Literal["px4", "ardupilot", "ros", "imu_calib", "imu_pipeline", "kalibr", "json", "c"]
@@ -56,6 +56,7 @@ def export(
         File to write; else stdout.
     """
     from fieldcal.exports import AUTOPILOTS
+    from fieldcal.remote.url import RemoteError
     from fieldcal.warehouse.files import write_bytes
     from fieldcal.words.talk import say
 
@@ -74,7 +75,7 @@ def export(
         write_bytes(output, result.text.encode())
     try:
         root.record_export(constants, to, result, author=author, temperature_degc=at_temperature)
-    except fieldcal.WarehouseError as error:
+    except (fieldcal.WarehouseError, RemoteError) as error:
         say(f"That it was exported is not remembered. {error}")
     return 0
 
@@ -134,7 +135,7 @@ def compare(
 
 
 def apply(
-    log: Path,
+    log: Place,
     /,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
@@ -159,10 +160,12 @@ def apply(
         °C; else each sample's own temperature, 25 where the log has none.
     """
     from fieldcal.cli.show import print_json
+    from fieldcal.remote.places import log_at
     from fieldcal.words.talk import say
 
-    _keep(log, output)
-    recording = fieldcal.read_log(log, config=config, vehicle=vehicle)
+    own = log_at(log)
+    _keep(own, output)
+    recording = fieldcal.read_log(own, config=config, vehicle=vehicle)
     constants = fieldcal.Warehouse(warehouse).calibration_at(recording.vehicle_id, at_temperature)
     calibrated = fieldcal.apply(recording, constants, follow_temperature=at_temperature is None)
     written, unsaid = calibrated.write(output)

@@ -18,7 +18,19 @@ from fieldcal.cli.fly import apply, compare, export
 from fieldcal.cli.interrupt import interruptible
 from fieldcal.cli.look import init, inspect
 from fieldcal.cli.onboard import onboard, refit
-from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Wide, Workers
+from fieldcal.cli.options import (
+    AsCsv,
+    AsJson,
+    Config,
+    DryRun,
+    Place,
+    Root,
+    Runner,
+    Scheduler,
+    SessionFolder,
+    Wide,
+    Workers,
+)
 from fieldcal.cli.pooled import plan, pooled
 from fieldcal.cli.report import report as report_command
 from fieldcal.cli.report import site
@@ -63,12 +75,12 @@ def demo(folder: Path = Path("fieldcal-demo"), /, *, warehouse: Root = None, con
     """
     from fieldcal.cli.present.demo import run_demo
 
-    return LOSSES if run_demo(folder, warehouse or folder / "fieldcal-data", config) else OK
+    return LOSSES if run_demo(folder, _root(warehouse or str(folder / "fieldcal-data")), config) else OK
 
 
 @app.command
 def calibrate(
-    log: Path,
+    log: Place,
     /,
     *,
     vehicle: str | None = None,
@@ -120,7 +132,7 @@ def calibrate(
 
 @app.command
 def nightly(
-    archive: Path,
+    archive: Place,
     /,
     *,
     workers: Workers = 1,
@@ -137,11 +149,12 @@ def nightly(
     Parameters
     ----------
     archive
-        Folder of logs: ARCHIVE/<vehicle>/<session>/<log>.
+        Folder of logs: ARCHIVE/<vehicle>/<session>/<log>; or its URL in an object store (s3://, gs://, az://).
     """
-    _need_folder(archive, ReasonCode.NO_ARCHIVE, "archive")
+    from fieldcal.remote.places import archive_at
+
     where = {"runner": runner, "scheduler": scheduler}
-    return _night(archive.absolute(), None, workers, where, (dry_run, as_json, wide), warehouse, config)
+    return _night(archive_at(archive), None, workers, where, (dry_run, as_json, wide), warehouse, config)
 
 
 @app.command
@@ -163,12 +176,13 @@ def session(
     Parameters
     ----------
     folder
-        Folder of the session: ARCHIVE/<vehicle>/<session>.
+        Folder of the session: ARCHIVE/<vehicle>/<session>, or its URL.
     """
-    _need_folder(folder, ReasonCode.NO_SESSION, "session folder")
-    own = folder.absolute()
+    from fieldcal.remote.places import session_at
+
+    archive, own = session_at(folder)
     where = {"runner": runner, "scheduler": scheduler}
-    return _night(own.parent.parent, own, workers, where, (dry_run, as_json, wide), warehouse, config)
+    return _night(archive, own, workers, where, (dry_run, as_json, wide), warehouse, config)
 
 
 @app.command
@@ -234,7 +248,7 @@ def sql(
 @app.command
 def verify(
     *,
-    archive: Path | None = None,
+    archive: Place | None = None,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -248,12 +262,16 @@ def verify(
     """
     from fieldcal.cli.show import print_json
     from fieldcal.logs import log_sha256
+    from fieldcal.remote.content import here
+    from fieldcal.remote.places import archive_at
     from fieldcal.warehouse.upkeep.verify import verify as check
     from fieldcal.words.talk import say
 
-    if archive is not None:
-        _need_folder(archive, ReasonCode.NO_ARCHIVE, "archive")
-    result = check(_root(warehouse), archive, log_sha256)
+    def sha256_of(log: Path) -> str:
+        with here(log):
+            return log_sha256(log)
+
+    result = check(_root(warehouse), None if archive is None else archive_at(archive), sha256_of)
     if as_json:
         print_json(result)
     else:
@@ -291,7 +309,7 @@ def upgrade(*, dry_run: DryRun = False, as_json: AsJson = False, warehouse: Root
 @app.command
 def doctor(
     *,
-    archive: Path | None = None,
+    archive: Place | None = None,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -307,8 +325,9 @@ def doctor(
 
     from fieldcal.cli.doctor import examine, lines
     from fieldcal.cli.show import print_json
+    from fieldcal.remote.places import folder_at
 
-    result = examine(_root(warehouse), archive, config)
+    result = examine(_root(warehouse), folder_at(archive, "doctor --archive") if archive else None, config)
     if as_json:
         print_json(asdict(result))
     else:
@@ -385,7 +404,7 @@ def _night(
     workers: int,
     where: dict[str, str | None],
     how: tuple[bool, bool, bool],
-    warehouse: Path | None,
+    warehouse: str | None,
     config: Path | None,
 ) -> int:
     from fieldcal.cli.show import print_json
@@ -420,15 +439,10 @@ def _night(
     return OK if result["ok"] == len(result["logs"]) else LOSSES
 
 
-def _root(warehouse: Path | None) -> Path:
+def _root(warehouse: str | None) -> Path:
     from fieldcal.warehouse import Warehouse
 
     return Warehouse(warehouse).root
-
-
-def _need_folder(folder: Path, reason_code: ReasonCode, what: str) -> None:
-    if not folder.is_dir():
-        raise _usage(reason_code, f"There is no {what} at {folder}.")
 
 
 def _usage(reason_code: ReasonCode, sentence: str) -> Exception:

@@ -39,12 +39,17 @@ def prune(
     from fieldcal.cli.show import print_json
     from fieldcal.warehouse.lock import fleet_lock
     from fieldcal.warehouse.questions import existing, moment_of
-    from fieldcal.warehouse.upkeep.prune import all_results, former_results, of_vehicle, remove
+    from fieldcal.warehouse.remote.garbage import Garbage, garbage
+    from fieldcal.warehouse.upkeep.prune import Removable, all_results, former_results, of_vehicle, remove
     from fieldcal.warehouse.upkeep.prune import signals_before as old_signals
 
     root = existing(fieldcal.Warehouse(warehouse).root).root
     removable = [all_results(root) if stages else former_results(root)]
+    former = garbage(root)
     if signals_before is not None:
+        if former is not None:
+            told = "--signals-before is for a warehouse on this machine; by URL readings stay."
+            raise fieldcal.FieldcalError(ReasonCode.WRONG_OPTION, told)
         moment = moment_of("--signals-before", signals_before)
         if moment > datetime.now(UTC):
             told = f"--signals-before {signals_before} has not come yet."
@@ -52,16 +57,15 @@ def prune(
         removable.append(old_signals(root, moment))
     if vehicle is not None:
         removable.append(of_vehicle(root, vehicle))
-    told_of = [
-        {"what": one.what, "lost": one.lost, "files": len(one.files), "bytes": one.size_bytes} for one in removable
-    ]
-    lines = [
-        f"{one.what}: {len(one.files)} files, {one.size_bytes / 1e6:.1f} MB. Lost is {one.lost}." for one in removable
-    ]
+    every: list[Removable | Garbage] = [*removable, *([former] if former is not None else [])]
+    told_of = [{"what": one.what, "lost": one.lost, "files": len(one.files), "bytes": one.size_bytes} for one in every]
+    lines = [f"{one.what}: {len(one.files)} files, {one.size_bytes / 1e6:.1f} MB. Lost is {one.lost}." for one in every]
     if yes:
         with fleet_lock(root):
             for one in removable:
                 remove(root, one)
+            if former is not None:
+                former.remove()
     if as_json:
         print_json({"removed": yes, "what": told_of})
         return 0

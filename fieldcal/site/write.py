@@ -18,6 +18,7 @@ from fieldcal.site.snapshot import Snapshot
 from fieldcal.site.vehicle_pages import flight_files, vehicle_files
 from fieldcal.warehouse.layout import SITE, prepare
 from fieldcal.warehouse.questions import existing
+from fieldcal.warehouse.remote.pages import at_hand
 
 INDEX = "index.html"
 ALWAYS = f"{DATA}/fleet.js"
@@ -56,8 +57,10 @@ def write_pages(snapshot: Snapshot, fitness: Mapping[str, Fitness]) -> Path:
     ledgers = Ledger.all_of(root)
     code = code_digest()
     for vehicle_id, one in fitness.items():
-        own = flights.filter(vehicle_id=vehicle_id)["flight_id"].to_list()
-        _vehicle(snapshot, one, own, links, ledgers.pop(vehicle_id, None), written, code)
+        ledger = ledgers.pop(vehicle_id, None) or Ledger(root, vehicle_id)
+        every = flights.filter(vehicle_id=vehicle_id)["flight_id"]
+        own = [flight for flight in every if flight in ledger.of_flights or at_hand(root, flight)]
+        _vehicle(snapshot, one, own, links, ledger, written, code)
     _fleet(snapshot, fitness, links, written)
     for ledger in ledgers.values():
         ledger.forget()
@@ -70,12 +73,11 @@ def _vehicle(
     one: Fitness,
     flights: list[str],
     links: Links,
-    ledger: Ledger | None,
+    ledger: Ledger,
     written: Written,
     code: str,
 ) -> None:
     """The vehicle's pages and its flights', where what they show, or the code that makes them, is another."""
-    ledger = ledger or Ledger(snapshot.root, one.vehicle_id)
     of = vehicle_digest(snapshot, one, code)
     if ledger.of == of and all(written.has(files) for files in (ledger.files, *ledger.of_flights.values())):
         written.keep(ledger)
