@@ -28,6 +28,7 @@ from fieldcal.batch.closing import close_night
 from fieldcal.batch.flights import one_flight
 from fieldcal.batch.night import plan_night, publishings
 from fieldcal.config.configuration import Alerts
+from fieldcal.report.fitness import Criteria
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.site import write_site
@@ -35,7 +36,7 @@ from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.publish import publish
 
 KINDS = ("step", "drifting", "outlier")
-FOREVER = Alerts(expires_days=1e5, idle_days=1e5)
+FOREVER = Criteria(Alerts(expires_days=1e5, idle_days=1e5))
 
 
 def main() -> int:

@@ -4,6 +4,8 @@ One unit's gyroscope steps by ten session sds, one drifts, one is unlike its sib
 spoiled by a magnet. Every unit has temperature coefficients of its own.
 
     python benchmarks/drift_fleet.py                    many fleets as rows of the history: seconds
+    python benchmarks/drift_fleet.py --sessions 8       the same of young fleets: what so few sessions tell
+    python benchmarks/drift_fleet.py --sessions 18 --tell        when a drift is named, and was said to be
     python benchmarks/drift_fleet.py --logs FOLDER      one fleet as simulated logs through `fieldcal nightly`: minutes
 """
 
@@ -12,6 +14,7 @@ from __future__ import annotations
 import argparse
 import datetime as dt
 import json
+import re
 import subprocess
 import sys
 import time
@@ -34,7 +37,8 @@ COLDEST_DEGC, WARMEST_DEGC = -10.0, 45.0
 WARMING_DEGC = 1.0
 """over a flight"""
 STEP_UNIT, DRIFTING_UNIT, OUTLIER_UNIT, MAGNET_UNIT = 0, 1, 2, 3
-STEP_SESSION, MAGNET_SESSIONS = 14, (8, 17)
+STEP_SESSION = 14
+MAGNET_SESSIONS: tuple[int, ...] = (8, 17)
 STEP_SDS = 10.0
 DRIFT_SDS_A_SESSION = 0.5
 OUTLIER_SPREADS = 12.0
@@ -129,6 +133,7 @@ def _frame(
             "session_id": [f"s{i:02d}" for i in k],
             "flight_id": [f"{i:02d}-{j:02d}" for i, j in zip(u, k, strict=True)],
             "started_at": pl.Series([START + dt.timedelta(days=7 * int(i)) for i in k], dtype=pl.Datetime("us", "UTC")),
+            "sequence": [0] * value.size,
             "axis": ["xyz"[i] for i in a],
             "value": value.ravel(),
             "sd": sd.ravel(),
@@ -223,6 +228,7 @@ def judged(table: pl.DataFrame, fleet: Fleet) -> dict[str, Any]:
         "error / sd of slopes, rms": float(np.sqrt(np.nanmean((error / sd) ** 2))),
         "median error of slopes": float(np.median(np.abs(error / truth))),
         "step named": step["status"] == "step",
+        "step named or moved": step["status"] in ("step", "drifting"),
         "step late by sessions": late,
         "step size off by": None if late is None else step["change_size"] / (STEP_SDS * SESSION_SD["gyroscope"]) - 1.0,
         "drifting named": row(DRIFTING_UNIT, "y")["status"] == "drifting",
@@ -247,8 +253,17 @@ def as_rows(seeds: int, first: int, understated: float) -> None:
     size = np.array([f["step size off by"] for f in found if f["step size off by"] is not None])
     late = np.array([f["step late by sessions"] for f in found if f["step late by sessions"] is not None])
     print(f"{seeds} fleets (seeds from {first}) of {UNITS} units x {SESSIONS} sessions, 48 rows a unit, as rows")
-    for name in ("slopes within 5 % or 3 sd", "of output error", "step named", "drifting named", "outlier named"):
+    for name in (
+        "slopes within 5 % or 3 sd",
+        "of output error",
+        "step named",
+        "step named or moved",
+        "drifting named",
+        "outlier named",
+    ):
         print(f"  {name:32s} {np.mean([f[name] for f in found]):.4f}")
+    if not len(late):
+        return
     print(f"  {'step within one session':32s} {np.mean(np.abs(late) <= 1):.4f}")
     sized, rms = np.mean(np.abs(size) <= SIZE_BAR), np.sqrt(np.mean(size**2))
     print(f"  {'step size within 15 %':32s} {sized:.4f}   (rms {rms:.3f})")
@@ -259,6 +274,33 @@ def as_rows(seeds: int, first: int, understated: float) -> None:
     rms = np.sqrt(np.mean(error**2))
     print(f"  {'error / sd of slopes, rms':32s} {rms:.3f}   (fleets {error.min():.2f} to {error.max():.2f})")
     print(f"  {'CPU per IMU':32s} {1e3 * seconds / seeds / UNITS:.1f} ms")
+
+
+def late_by(seed: int, first: int, last: int) -> list[int]:
+    """How many sessions later than a stable row's `reason` said the drifting unit was named, each time that it said
+    something, from its first sessions on."""
+    flights = rows_of_history(draw(seed), seed)
+    said: dict[int, int] = {}
+    for n in range(first, last + 1):
+        table = table_of(flights.filter(pl.col("session_id") < f"s{n:02d}"))
+        unit = f"unit-{DRIFTING_UNIT:02d}"
+        place = {"sensor": "gyroscope", "parameter": "zero_bias", "method": "output_error", "axis": "y"}
+        row = table.row(by_predicate=pl.all_horizontal(pl.col("unit_id") == unit, *_same(place)), named=True)
+        if row["status"] == "drifting":
+            return [n - at - more for at, more in said.items()]
+        if (told := re.search(r"May drift.* about (\d+) more", row["reason"] or "")) is not None:
+            said[n] = int(told[1])
+    return []
+
+
+def _same(place: dict[str, str]) -> list[pl.Expr]:
+    return [pl.col(name) == value for name, value in place.items()]
+
+
+def as_told(seeds: int, first_seed: int) -> None:
+    late = np.array([by for seed in range(first_seed, first_seed + seeds) for by in late_by(seed, 7, SESSIONS)])
+    print(f"{len(late)} sentences on how many more sessions would tell, {seeds} fleets: the drift was named later by")
+    print(f"  median {np.median(late):.0f}, 10 to 90 % {np.percentile(late, 10):.0f} to {np.percentile(late, 90):.0f}")
 
 
 def as_logs(folder: Path, seed: int, duration_s: float, workers: int) -> None:
@@ -279,17 +321,29 @@ def as_logs(folder: Path, seed: int, duration_s: float, workers: int) -> None:
         print(f"  {name:32s} {value}")
 
 
+def of_sessions(sessions: int) -> None:
+    """Fleets of so many sessions instead, with one step and one drifting unit alone."""
+    global SESSIONS, STEP_SESSION, MAGNET_SESSIONS
+    SESSIONS, STEP_SESSION, MAGNET_SESSIONS = sessions, round(sessions * STEP_SESSION / SESSIONS), ()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=100, help="fleets that are rows")
     parser.add_argument("--first-seed", type=int, default=0, help="of the fleets that are rows")
+    parser.add_argument("--sessions", type=int, help="of a unit, without spoiled flights; else 24 with them")
+    parser.add_argument("--tell", action="store_true", help="how many more sessions would tell, and did")
     parser.add_argument("--understated", type=float, default=1.0, help="equation error states its sd so much too small")
     parser.add_argument("--logs", type=Path, help="one fleet as logs, in this folder")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--duration", type=float, default=30.0, help="seconds a simulated flight lasts")
     parser.add_argument("--workers", type=int, default=1)
     options = parser.parse_args()
-    if options.logs is None:
+    if options.sessions is not None:
+        of_sessions(options.sessions)
+    if options.tell:
+        as_told(options.seeds, options.first_seed)
+    elif options.logs is None:
         as_rows(options.seeds, options.first_seed, options.understated)
     else:
         as_logs(options.logs, options.seed, options.duration, options.workers)

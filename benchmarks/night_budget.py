@@ -28,6 +28,7 @@ from fieldcal.batch.flights import one_flight
 from fieldcal.batch.night import plan_night, publishings
 from fieldcal.batch.steps import FlightWork
 from fieldcal.flight.threads import one_thread
+from fieldcal.report.fitness import Criteria
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse.stage_store import StageStore
@@ -92,7 +93,7 @@ def main() -> None:
                 publishing.publish()
             night.remember(outcomes)
         with budget.on("trends, report"):
-            close_night(root, night.configuration.alerts)
+            close_night(root, Criteria.of(night.configuration))
         with budget.on("plan, nothing new"):
             again = plan_night(archive, root)
         assert len(again.plan.done) == given.flights

@@ -9,7 +9,7 @@ from fieldcal.batch.documents import LogEntry, NightDocument
 from fieldcal.batch.outcome import verdict_counts
 from fieldcal.flows.connection import answers
 from fieldcal.names import Verdict
-from fieldcal.trends.changes import Change
+from fieldcal.report.standing.news import Change
 
 KEY = "fieldcal-night"
 MOST_ROWS = 500
@@ -32,7 +32,7 @@ def keep_artifact(result: NightDocument, root: Path) -> None:
     told = (
         f"{len(result['logs'])} logs: {counts}. {result['stages_run']} stages run, {result['stages_cached']} from the "
         f"cache. History: `{root}/tables`. Report: `{result['report']}`."
-        f" Site: `{result['site']}`."
+        + (f" Site: `{result['site']}`." if result["site"] else "")
     )
     if len(rows) > MOST_ROWS:
         told += f" The first {MOST_ROWS} of {len(rows)} rows; all: `fieldcal sql 'SELECT * FROM refusals'`."

@@ -28,6 +28,9 @@ from fieldcal.flows.tasks import publish_as_task, run_batch
 from fieldcal.names import Status
 from fieldcal.provenance.run_key import code_digest
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.remote.places import archive_at, session_at
+from fieldcal.report.fitness import Criteria
+from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.words.printable import printable
 from fieldcal.words.talk import say
@@ -50,7 +53,7 @@ def nightly(
     Parameters
     ----------
     archive, warehouse, config
-        Folder of logs, data root, `fieldcal.toml` if not the archive's own.
+        Folder of logs and data root, or their URLs; `fieldcal.toml` if not the archive's own.
     workers, runner, scheduler
         Where the batches of flights run (`fieldcal.flows.runners.Parallel`); results do not depend on it.
 
@@ -64,7 +67,7 @@ def nightly(
     ConfigurationError, WarehouseError
         What concerns every log.
     """
-    night = plan_night(Path(archive), Path(warehouse), Path(config) if config else None)
+    night = plan_night(archive_at(archive), Warehouse(warehouse).root, Path(config) if config else None)
     return carry_out(night, Parallel(workers, runner, scheduler))
 
 
@@ -78,8 +81,8 @@ def session(
     scheduler: str | None = None,
 ) -> NightDocument:
     """The same for the one session folder `<archive>/<vehicle>/<session>`."""
-    place = Path(folder)
-    night = plan_night(place.parent.parent, Path(warehouse), Path(config) if config else None, place)
+    archive, place = session_at(folder)
+    night = plan_night(archive, Warehouse(warehouse).root, Path(config) if config else None, place)
     return carry_out(night, Parallel(workers, runner, scheduler))
 
 
@@ -124,6 +127,7 @@ def carry_out(
 ) -> NightDocument:
     """Run what the plan says, within a flow run; the JSON of the night. People are told what is new in it, or that it
     failed."""
+    parallel.reaches(night.archive, night.root)
     tell_while_heard()
     with alive(night.root), telling(night) as tell:
         if watcher is not None:
@@ -137,7 +141,7 @@ def carry_out(
         for publishing in publishings(night, outcomes):
             publish_as_task(publishing)
         night.remember(outcomes)
-        closing = close_night(night.root, night.configuration.alerts)
+        closing = close_night(night.root, Criteria.of(night.configuration), with_site=night.configuration.writes_site)
         result = night.document(outcomes, closing)
         keep_artifact(result, night.root)
         tell_prefect(closing.changes)

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from fieldcal.batch.documents import Answer, Batch
 from fieldcal.errors import FieldcalError
 from fieldcal.flight.job import Job
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.remote.cache import ARCHIVES, WAREHOUSES, called, origin
 
 if TYPE_CHECKING:
     from prefect import Task
@@ -46,6 +48,23 @@ class Parallel:
             raise FieldcalError(
                 ReasonCode.WRONG_OPTION, f"runner must be one of {', '.join(RUNNERS)}, not {self.runner!r}."
             )
+
+    def reaches(self, archive: Path, root: Path) -> None:
+        """Make sure that the workers see what the night works on.
+
+        Raises
+        ------
+        FieldcalError
+            `wrong_option`: copies of what lies in an object store are for processes of this machine.
+        """
+        elsewhere = self.runner == "pool" or self.scheduler is not None
+        copies = [called(one) for kind, one in ((ARCHIVES, archive), (WAREHOUSES, root)) if origin(kind, one)]
+        if elsewhere and copies:
+            told = (
+                f"Workers on other machines do not see the copy of {copies[0]} that is on this one: run the night or "
+                "its sessions on each machine, with --runner process."
+            )
+            raise FieldcalError(ReasonCode.WRONG_OPTION, told)
 
     def spawned(self, n_batches: int) -> int:
         """How many processes of this machine so many batches keep busy; one too, for a log may have its own ended."""

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.remote.cache import WAREHOUSES, origin
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import file_sha256, write_bytes
 from fieldcal.warehouse.layout import checksum_path, history_files
@@ -88,6 +89,12 @@ def assure(root: Path, paths: Iterable[Path], *, strict: bool = False) -> None:
             raise WarehouseError(ReasonCode.DAMAGED_FILE, told)
 
 
+def assured(root: Path, path: Path) -> str:
+    """The sha256 of a file that holds what was written; raises as `assure`, strictly."""
+    assure(root, [path], strict=True)
+    return file_sha256(path)
+
+
 def _wrong(root: Path, path: Path, strict: bool) -> str | None:
     if not path.exists():
         return None
@@ -102,6 +109,8 @@ def _wrong(root: Path, path: Path, strict: bool) -> str | None:
 
 def remedy(root: Path, path: Path) -> str:
     """What to do about a damaged file: what people decided and exported no night makes anew."""
+    if (copy := origin(WAREHOUSES, root)) is not None:
+        return f"Remove it: it is a copy of what lies at {copy[1]}, and is fetched anew."
     beside = checksum_path(root, path)
     if path.is_relative_to(root / "tables") and path.relative_to(root / "tables").parts[0] in ("decision", "export"):
         return f"Restore it: no night makes it anew. Without a copy of it, remove it and {beside}, and decide again."

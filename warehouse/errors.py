@@ -9,6 +9,7 @@ from pathlib import Path
 
 from fieldcal.errors import FieldcalError
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.remote.cache import called
 
 
 class WarehouseError(FieldcalError):
@@ -23,6 +24,12 @@ class WarehouseError(FieldcalError):
     ...     print(error.reason_code)
     no_warehouse
     """
+
+
+def no_warehouse(root: Path) -> WarehouseError:
+    """What is told where nothing was ever published."""
+    told = f"There is no warehouse at {called(root)}; run `fieldcal nightly` or give --warehouse."
+    return WarehouseError(ReasonCode.NO_WAREHOUSE, told)
 
 
 _KNOWN = {

@@ -26,6 +26,7 @@ SIGNAL_PARTITION = "vehicle_id="
 PARTITION, FORMER_PARTITION = "vehicle=", "vehicle_id="
 """Of the history, whose files have the column vehicle_id: engines that take a folder's name for a column guess its
 type, and fail where the file has a column of that name and another type. `fieldcal upgrade` renames former folders."""
+LOCK = ".lock-"
 SITE = "site"
 """Folder of the pages below the data root; `night/site` remembers what they were made from."""
 
@@ -129,7 +130,7 @@ def checksum_path(root: Path, path: Path) -> Path:
 
 def lock_path(root: Path, vehicle_id: str) -> Path:
     """Lock that guards the publishing of a vehicle."""
-    return root / f".lock-{encode_id(vehicle_id)}"
+    return root / f"{LOCK}{encode_id(vehicle_id)}"
 
 
 def prepare(root: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from fieldcal.file_locks import fcntl
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse.errors import WarehouseError, disk
-from fieldcal.warehouse.layout import lock_path, prepare
+from fieldcal.warehouse.layout import LOCK, lock_path, prepare
 
 _RETRY_S = 0.02
 
@@ -26,6 +26,13 @@ def vehicle_lock(root: Path, vehicle_id: str, timeout_s: float = 300.0) -> Itera
         `busy`: another process held it for `timeout_s`.
     """
     with _lock(root, lock_path(root, vehicle_id), f"publishing vehicle {vehicle_id!r}", timeout_s):
+        yield
+
+
+@contextmanager
+def named_lock(root: Path, name: str, timeout_s: float = 300.0) -> Iterator[None]:
+    """The same lock, of a vehicle by its name in paths."""
+    with _lock(root, root / f"{LOCK}{name}", f"publishing vehicle {name!r}", timeout_s):
         yield
 
 

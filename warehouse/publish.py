@@ -22,7 +22,7 @@ from fieldcal.warehouse.decisions.withdrawn import DECIDED, as_decided, decision
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import history_path
-from fieldcal.warehouse.lock import vehicle_lock
+from fieldcal.warehouse.remote.turn import in_turn
 from fieldcal.warehouse.store import conform, empty_frame, frame, read_arrow, read_table, table_bytes
 
 _ORDER = (*(name for name in FLIGHT_TABLES if name != "flight"), *FLEET_TABLES, "flight")
@@ -66,28 +66,33 @@ def publish(
     prepared = {table: _prepared(table, new, vehicle_id) for table, new in rows.items()}
     for table in prepared.keys() & FLIGHT_TABLES:
         _only(table, "flight", prepared[table]["flight_id"], set(flights))
-    changed = []
-    with vehicle_lock(root, vehicle_id, timeout_s):
+
+    def replace() -> tuple[str, ...]:
+        changed = []
         for table in _ORDER:
             new = prepared.get(table)
             if (table in FLEET_TABLES and new is None) or (new is None and not flights):
                 continue
             if _replace(root, table, vehicle_id, empty_frame(table) if new is None else new, flights):
                 changed.append(table)
-    return tuple(changed)
+        return tuple(changed)
+
+    return in_turn(root, vehicle_id, replace, flights=flights, timeout_s=timeout_s)
 
 
 def append(root: Path, vehicle_id: str, table: str, rows: pl.DataFrame, *, timeout_s: float = 300.0) -> None:
     """Add rows to a vehicle's `decision` or `export`; raises as `publish`."""
     new = _prepared(table, rows, vehicle_id)
-    with vehicle_lock(root, vehicle_id, timeout_s):
-        _replace(root, table, vehicle_id, new, ())
+    in_turn(root, vehicle_id, lambda: _replace(root, table, vehicle_id, new, ()), timeout_s=timeout_s)
 
 
 def settle(root: Path, vehicle_id: str, *, timeout_s: float = 300.0) -> tuple[str, ...]:
     """Bring the statuses of a vehicle's rows up to what is decided; the tables that changed. Raises as `publish`."""
-    with vehicle_lock(root, vehicle_id, timeout_s):
+
+    def follow() -> tuple[str, ...]:
         return tuple(table for table in DECIDED if _replace(root, table, vehicle_id, empty_frame(table), ()))
+
+    return in_turn(root, vehicle_id, follow, timeout_s=timeout_s)
 
 
 def read_history(root: Path, table: str, vehicle_id: str) -> pl.DataFrame:

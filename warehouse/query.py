@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Unpack
 
 import polars as pl
 
+from fieldcal.remote.url import is_url
 from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES, signal_kind
 from fieldcal.schemas.migrations import fillings
 from fieldcal.warehouse.checksums import assure
 from fieldcal.warehouse.layout import encode_id, history_files, history_path, signal_files, signal_path, vehicle_name
+from fieldcal.warehouse.remote.signals import fetch_signals
 from fieldcal.warehouse.signals import signal_ids
 from fieldcal.warehouse.store import by_absent_columns, empty_frame
 from fieldcal.warehouse.views import AT, VIEWS
@@ -29,11 +31,17 @@ class Warehouse:
     Parameters
     ----------
     root : Path or str, optional
-        Data root; else `FIELDCAL_WAREHOUSE`, else `./fieldcal-data`.
+        Data root, or its URL (s3://, gs://, az://), of which a local copy is brought up to date; else
+        `FIELDCAL_WAREHOUSE`, else `./fieldcal-data`.
     """
 
     def __init__(self, root: Path | str | None = None) -> None:
-        self.root = Path(root or os.environ.get("FIELDCAL_WAREHOUSE") or DEFAULT_ROOT)
+        place = root or os.environ.get("FIELDCAL_WAREHOUSE") or DEFAULT_ROOT
+        if is_url(place):
+            from fieldcal.warehouse.remote.copy import local_warehouse  # what reads a store, which few need
+
+            place = local_warehouse(str(place))
+        self.root = Path(place)
 
     def scan(self, table: str, *, vehicle_id: str | None = None, flight_id: str | None = None) -> pl.LazyFrame:
         """A table or a view as a lazy frame; a table typed and empty when there is nothing yet.
@@ -83,6 +91,7 @@ class Warehouse:
         return rows
 
     def _signals(self, table: str, vehicle_id: str | None, flight_id: str | None) -> pl.LazyFrame:
+        fetch_signals(self.root, table, vehicle_id, flight_id)
         if vehicle_id is not None and flight_id is not None:
             files = [path for path in [signal_path(self.root, table, vehicle_id, flight_id)] if path.exists()]
         else:

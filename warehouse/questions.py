@@ -11,8 +11,9 @@ import polars as pl
 from fieldcal.errors import FieldcalError
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.columns import FLOWN_ORDER
-from fieldcal.warehouse import Warehouse, WarehouseError
+from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.decisions.withdrawn import counting
+from fieldcal.warehouse.errors import no_warehouse
 
 MOST_NAMED = 5
 COLUMNS = (
@@ -124,9 +125,7 @@ def existing(root: Path) -> Warehouse:
         `no_warehouse`.
     """
     if not root.is_dir():
-        raise WarehouseError(
-            ReasonCode.NO_WAREHOUSE, f"There is no warehouse at {root}; run `fieldcal nightly` or give --warehouse."
-        )
+        raise no_warehouse(root)
     return Warehouse(root)
 
 

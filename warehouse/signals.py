@@ -11,6 +11,7 @@ import polars as pl
 from fieldcal.schemas import signal_kind
 from fieldcal.warehouse import checksums
 from fieldcal.warehouse.layout import decode_id, prepare, signal_path, vehicle_of
+from fieldcal.warehouse.remote.signals import fetch_signals
 from fieldcal.warehouse.store import TableWriter, read_facts, read_table
 
 
@@ -32,9 +33,18 @@ def signal_writer(
     return TableWriter(kind, path, units=units, metadata=facts, around_rename=partial(checksums.recording, root, path))
 
 
+def has_signal(root: Path, table: str, vehicle_id: str, flight_id: str) -> bool:
+    """Whether readings of a flight are kept; by URL they are fetched for it."""
+    path = signal_path(root, table, vehicle_id, flight_id)
+    if not path.exists():
+        fetch_signals(root, table, vehicle_id, flight_id)
+    return path.exists()
+
+
 def read_signal(root: Path, table: str, vehicle_id: str, flight_id: str) -> pl.DataFrame:
     """Readings of one flight, held against their recorded sha256."""
     path = signal_path(root, table, vehicle_id, flight_id)
+    has_signal(root, table, vehicle_id, flight_id)
     checksums.assure(root, [path])
     return read_table(path, signal_kind(table))
 

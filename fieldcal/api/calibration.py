@@ -23,6 +23,7 @@ from fieldcal.geometry import sensor_model
 from fieldcal.logs.on_board import PRIMARY
 from fieldcal.names import JOINT_METHODS, SENSORS, Approach, Json, exactness
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.remote.places import log_at
 from fieldcal.schemas.rows import FlightDocument, Refusable, SyncRow
 from fieldcal.stages.composition import ORIGIN, in_log
 from fieldcal.stages.tables import matrix, seconds
@@ -287,6 +288,18 @@ class Calibration:
             refused=own.reason,
         )
 
+    @property
+    def nominal_scale(self) -> dict[str, tuple[float, float, float]]:
+        """Scale of each sensor's data sheet, by axis, where it is known: 1 where the log is in physical units.
+
+        Examples
+        --------
+        >>> fieldcal.calibrate(log).nominal_scale  # doctest: +SKIP
+        {'accelerometer': (1.0, 1.0, 1.0), 'gyroscope': (1.0, 1.0, 1.0)}
+        """
+        known = {} if self._log.settings is None else self._log.settings.nominal_scale
+        return {str(sensor): own for sensor, own in known.items() if own is not None}
+
     def _rates(self) -> Rates | None:
         """Calibrated gyroscope in body axes, refused or not; None without numbers."""
         own = self.gyroscope
@@ -380,7 +393,7 @@ def calibrate(
         own = as_recording(log, config, vehicle).source
         wanted = overruled(own.vehicle, profile=profile, method=method, changes=changes)
         return _calibration(replace(own, vehicle=wanted), unit)
-    job, configured = identify(Path(log), None if config is None else Path(config), vehicle_id=vehicle)
+    job, configured = identify(log_at(log), None if config is None else Path(config), vehicle_id=vehicle)
     return _calibration(read(job, overruled(configured, profile=profile, method=method, changes=changes)), unit)
 
 

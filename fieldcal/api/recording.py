@@ -14,6 +14,7 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.logs.facts import Facts
 from fieldcal.logs.ingest import started_at
 from fieldcal.names import SENSORS
+from fieldcal.remote.places import log_at
 from fieldcal.stages.tables import matrix, seconds, triad
 
 if TYPE_CHECKING:
@@ -164,8 +165,8 @@ def read_log(path: Path | str, *, config: Path | str | None = None, vehicle: str
     ----------
     path : Path or str
         An MCAP, ROS bag (file or folder), ULog, DataFlash or CSV file, or a folder with imu.csv; its vehicle and
-        session are the folders it lies in,
-        ``<vehicle>/<session>/<log>``.
+        session are the folders it lies in, ``<vehicle>/<session>/<log>``. Or its URL (``s3://``, ``gs://``, ``az://``):
+        it is fetched.
     config : Path or str, optional
         A fieldcal.toml: topics, columns, units. Otherwise the one in the folder above the vehicle's, if there is one.
     vehicle : str, optional
@@ -198,7 +199,7 @@ def read_log(path: Path | str, *, config: Path | str | None = None, vehicle: str
     >>> recording.findings
     ()
     """
-    job, own = identify(Path(path), None if config is None else Path(config), vehicle_id=vehicle)
+    job, own = identify(log_at(path), None if config is None else Path(config), vehicle_id=vehicle)
     return Recording.of(read(job, own))
 
 

@@ -72,7 +72,8 @@ class Warehouse(query.Warehouse):
     Parameters
     ----------
     root : Path or str, optional
-        Data root; else ``FIELDCAL_WAREHOUSE``, else ``./fieldcal-data``.
+        Data root, or its URL (``s3://``, ``gs://``, ``az://``): asked of a local copy, which is brought up to date
+        here; else ``FIELDCAL_WAREHOUSE``, else ``./fieldcal-data``.
 
     Raises
     ------
@@ -319,9 +320,12 @@ class Warehouse(query.Warehouse):
             `busy`, or the disk's refusal.
         """
         from fieldcal.exports.handed_out import record_export
+        from fieldcal.warehouse.remote.share import share
 
         at_degc = REFERENCE_DEGC if temperature_degc is None else temperature_degc
-        return record_export(self.root, constants, to, export, author=author or this_user(), at_degc=at_degc)
+        is_new = record_export(self.root, constants, to, export, author=author or this_user(), at_degc=at_degc)
+        share(self.root)
+        return is_new
 
     def exports(self, vehicle: str) -> list[HandedOut]:
         """The latest export of each sensor of a vehicle to an autopilot, and what became of it by the logs since."""
@@ -330,22 +334,23 @@ class Warehouse(query.Warehouse):
         return handed_out(self.root, vehicle)
 
     def _decide(self, decision: Decision, target: str, reason: str, author: str | None, part: Part) -> Decided:
-        from fieldcal.trends.drift_table import update_drift
-        from fieldcal.trends.pooled.table import update_pooled
+        from fieldcal.batch.trends import update_trends
         from fieldcal.warehouse.decisions.decide import decide, flights_meant
         from fieldcal.warehouse.layout import SITE
         from fieldcal.warehouse.lock import fleet_lock
+        from fieldcal.warehouse.remote.share import share
 
         columns = {"unit_id": part.get("unit"), **{name: part.get(name) for name in ("sensor", "parameter", "axis")}}
         named = {name: str(value) for name, value in columns.items() if value is not None}
         flights = flights_meant(self.root, target, part.get("session"))
         n = decide(self.root, flights, decision, reason=reason, author=author or this_user(), part=named)
         with fleet_lock(self.root):
-            trends = tuple(sorted({*update_drift(self.root), *update_pooled(self.root)}))
+            trends = tuple(sorted(update_trends(self.root)))
             if (self.root / SITE).is_dir():  # where nobody made one, none is made
                 from fieldcal.site import write_site
 
                 write_site(self.root)
+            share(self.root)
         return Decided(decision, tuple(flights["flight_id"].to_list()), n, trends)
 
 

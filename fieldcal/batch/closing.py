@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
 from fieldcal.batch.sources import TRENDS, sources
-from fieldcal.config.configuration import Alerts
-from fieldcal.names import Json
+from fieldcal.batch.trends import INPUTS, update_trends
 from fieldcal.provenance.run_key import run_key
-from fieldcal.schemas import FLEET_TABLES, FLIGHT_TABLES, HISTORY_TABLES, TABLES
+from fieldcal.report.fitness import Criteria, fleet_fitness
+from fieldcal.report.standing.memory import remember, remembered, remembered_fleet
+from fieldcal.report.standing.news import Change, news
+from fieldcal.schemas import FLEET_TABLES, HISTORY_TABLES, TABLES
 from fieldcal.schemas.arrow import VERSION_KEY
-from fieldcal.trends.changes import Change, changes, last_usable
-from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.checksums import assure, history_digest
 from fieldcal.warehouse.decisions.withdrawn import decisions
 from fieldcal.warehouse.errors import disk
-from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import history_files
 from fieldcal.warehouse.lock import fleet_lock
 from fieldcal.warehouse.publish import settle
-from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
+from fieldcal.warehouse.remote.copy import refresh
+from fieldcal.warehouse.remote.share import share
 from fieldcal.warehouse.store import read_facts
 from fieldcal.warehouse.upkeep.verify import night_files
 
-INPUTS = (*FLIGHT_TABLES, "decision")
 MOST_PAGES = 10
 
 
@@ -39,12 +38,13 @@ class Closing:
     site: Path | None = None
 
 
-def close_night(root: Path, alerts: Alerts) -> Closing:
+def close_night(root: Path, criteria: Criteria, *, with_site: bool = True) -> Closing:
     """Bring trends and reports up to the history; what is to be told tonight that was not told before.
 
-    Trends are regressed only where the history, or the code that makes them, is another than last time. Reports: the
-    fleet's page, and the pages of vehicles of which something is told; `fieldcal report` makes any other. The site has
-    all of them, and of it only what changed is written.
+    Trends are regressed only where the history, or the code that makes them, is another than last time. The fleet is
+    judged once: the site, the terminal and messages say the same. Reports: the fleet's page, and the pages of vehicles
+    of which something is told; `fieldcal report` makes any other. The site has all of them, and of it only what changed
+    is written.
 
     The history is held against its records first, so that no night ends well over damage that it had no need to read.
 
@@ -55,30 +55,29 @@ def close_night(root: Path, alerts: Alerts) -> Closing:
     """
     now = datetime.now(UTC)
     with fleet_lock(root):
+        refresh(root)
         assure(root, [path for table in HISTORY_TABLES for path in history_files(root, table)], strict=True)
         _forget_damaged(root)
-        before = _remembered(root)
+        before = remembered(root)
         _forget_older_versions(root)
         for vehicle_id in decisions(root)["vehicle_id"].unique().sort().to_list():
             settle(root, vehicle_id)  # where deciding was interrupted, rows do not follow yet
-        former = Warehouse(root).scan("drift").collect()
         made_from = _made_from(root)
         if before.get("made_from") != made_from or before.get("made") != history_digest(root, FLEET_TABLES):
-            from fieldcal.trends.drift_table import update_drift
-            from fieldcal.trends.pooled.table import update_pooled
+            update_trends(root)
+            made_from = _made_from(root)
+        from fieldcal.site.snapshot import Snapshot
+        from fieldcal.site.write import write_pages
 
-            update_drift(root)
-            update_pooled(root)
-        table = Warehouse(root).scan("drift").collect()
-        # With other limits than last time, what they make old is told whenever it passed them.
-        limits: dict[str, Json] = {"expires_days": alerts.expires_days, "idle_days": alerts.idle_days}
-        at = before.get("at")
-        since = datetime.fromisoformat(at) if isinstance(at, str) and before.get("alerts") == limits else None
-        told = changes(former, table, last_usable(root), now=now, since=since, alerts=alerts)
+        snapshot = Snapshot(root)
+        fleet = fleet_fitness(snapshot, criteria, now)
+        told = news(fleet, remembered_fleet(root))
+        report = _reports(root, told)
+        site = write_pages(snapshot, fleet) if with_site else None
         made = history_digest(root, FLEET_TABLES)
-        record = {"at": now.isoformat(), "made_from": made_from, "made": made, "alerts": limits}
-        write_bytes(_place(root), seal(record), durable=False)
-        return Closing(told, _reports(root, told), _site(root, alerts, now))
+        remember(root, fleet, criteria, {"made_from": made_from, "made": made})
+        share(root)
+        return Closing(told, report, site)
 
 
 def _reports(root: Path, told: Sequence[Change]) -> Path:
@@ -86,12 +85,6 @@ def _reports(root: Path, told: Sequence[Change]) -> Path:
 
     vehicles = list(dict.fromkeys(change.vehicle_id for change in told if change.kind not in ("expired", "idle")))
     return write_night_reports(root, vehicles[:MOST_PAGES])[0]
-
-
-def _site(root: Path, alerts: Alerts, now: datetime) -> Path:
-    from fieldcal.site import write_site
-
-    return write_site(root, alerts, now=now)
 
 
 def _forget_damaged(root: Path) -> None:
@@ -118,14 +111,3 @@ def _forget_older_versions(root: Path) -> None:
 def _made_from(root: Path) -> str:
     """Digest of what trends are made from: the history and the code that makes them of it."""
     return run_key(TRENDS, sources()[TRENDS], {}, {"history": history_digest(root, INPUTS)})
-
-
-def _remembered(root: Path) -> Mapping[str, Json]:
-    try:
-        return unseal(_place(root).read_bytes())
-    except (OSError, BrokenSeal):
-        return {}
-
-
-def _place(root: Path) -> Path:
-    return root / "night" / "closing.json"

@@ -8,7 +8,7 @@ from fieldcal.config.find import Source
 from fieldcal.flight.job import PlainJob
 from fieldcal.flight.record import Record, Refusal
 from fieldcal.logs.facts import FindingFacts
-from fieldcal.trends.changes import PlainChange
+from fieldcal.report.standing.news import PlainChange
 
 
 class PlainOutcome(TypedDict):
@@ -80,11 +80,12 @@ class UnreadEntry(TypedDict):
 
 
 class NightDocument(NightSummary):
-    """What `nightly --json` prints. `seconds` the whole duration, `server_seconds` what Prefect took of it."""
+    """What `nightly --json` prints. `site` None where `[site]` says that none is written; `seconds` the whole duration,
+    `server_seconds` what Prefect took of it."""
 
     changes: list[PlainChange]
     report: str
-    site: str
+    site: str | None
     unread: list[UnreadEntry]
     seconds: NotRequired[float]
     server_seconds: NotRequired[float]

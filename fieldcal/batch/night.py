@@ -13,6 +13,7 @@ from fieldcal.batch.closing import Closing
 from fieldcal.batch.documents import NightDocument
 from fieldcal.batch.ledgers.flights import Ledger
 from fieldcal.batch.ledgers.logs import write_ledger
+from fieldcal.batch.ledgers.shared import Shared
 from fieldcal.batch.outcome import Outcome, summary
 from fieldcal.batch.plan import Plan, make_plan
 from fieldcal.batch.publish_flights import publish_vehicle, take_out
@@ -57,7 +58,9 @@ class Night:
     def remember(self, outcomes: Sequence[Outcome]) -> None:
         """Remember, once it is published, what the next night need not look at."""
         if outcomes or len(self.plan.done) < len(self.plan.jobs):
-            Ledger(self.root, self.configuration).remember(outcomes, self.plan.done)
+            ledger = Ledger(self.root, self.configuration)
+            ledger.remember(outcomes, self.plan.done)
+            Shared(self.root).tell(self.archive, ledger.whole(outcomes))
 
     def document(self, outcomes: Sequence[Outcome], closing: Closing) -> NightDocument:
         """The JSON of the night, without how long it took."""
@@ -66,7 +69,7 @@ class Night:
             summary(outcomes, self.plan.done.values(), self.plan.copies, self.plan.copied, self.root)
         )
         unread = [asdict(one) for one in self.plan.unread]
-        pages = {"report": str(closing.report), "site": str(closing.site)}
+        pages = {"report": str(closing.report), "site": None if closing.site is None else str(closing.site)}
         return cast(NightDocument, {**told, "changes": changes, **pages, "unread": unread})
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from fieldcal.batch.documents import LogEntry
 from fieldcal.batch.jobs import find_jobs, without_copies
 from fieldcal.batch.ledgers.flights import Ledger
 from fieldcal.batch.ledgers.logs import read_ledger
+from fieldcal.batch.ledgers.shared import Shared
 from fieldcal.batch.steps import FlightWork
 from fieldcal.config.configuration import Configuration
 from fieldcal.flight.job import Job
@@ -37,11 +39,12 @@ class Plan:
 
 def make_plan(root: Path, archive: Path, configuration: Configuration, session: Path | None = None) -> Plan:
     """Find the logs and decide for each which steps must run."""
-    found = find_jobs(archive, configuration, session, read_ledger(root))
+    shared = Shared(root)
+    found = find_jobs(archive, configuration, session, read_ledger(root), partial(shared.log, archive))
     kept, copies = without_copies(found, *_known(root, archive))
     unread = find_unread(archive, {job.log_uri for job in found}, session)
     plan = Plan(copies=copies, copied=[job for job in found if job.log_uri in copies], unread=unread)
-    seen = Ledger(root, configuration)
+    seen = Ledger(root, configuration, shared)
     for job in kept:
         plan.jobs.append(job)
         if (entry := seen.entry(job)) is not None:

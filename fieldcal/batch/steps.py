@@ -34,6 +34,8 @@ from fieldcal.logs.tidy import Disordered
 from fieldcal.names import Json, Status, Verdict
 from fieldcal.provenance.run_key import run_key
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.remote.content import here
+from fieldcal.remote.url import RemoteError
 from fieldcal.stages.pipeline import INGEST, PIPELINE
 from fieldcal.stages.results import StageResult, plain
 from fieldcal.stages.stage import Stage, run_stage, stage_and_unit, step_of
@@ -208,9 +210,9 @@ class FlightWork:
         if self.job.problem is not None:
             return self._ingest_record(ingest.rejected(ReasonCode.NOT_READABLE, self.job.problem), {}, key, keep=False)
         try:
-            facts, signals = self._write_signals(whole=False)
-        except Disordered:
-            facts, signals = self._write_signals(whole=True)
+            facts, signals = self._read()
+        except RemoteError as error:
+            return self._ingest_record(ingest.rejected(error.reason_code, error.sentence), {}, key, keep=False)
         except WarehouseError:
             raise
         except Exception as error:
@@ -221,6 +223,14 @@ class FlightWork:
             why = f"{self.job.log_uri} changed while it was read; the next night takes it when it is complete."
             return self._ingest_record(ingest.rejected(ReasonCode.CHANGED_WHILE_READ, why), {}, key, keep=False)
         return self._ingest_record(facts, signals, key, keep=facts["reason_code"] != ingest.TOO_SLOW)
+
+    def _read(self) -> tuple[Facts, dict[str, Output]]:
+        """Read the log into the signal tables."""
+        with here(Path(self.job.path)):
+            try:
+                return self._write_signals(whole=False)
+            except Disordered:
+                return self._write_signals(whole=True)
 
     def _write_signals(self, *, whole: bool) -> tuple[Facts, dict[str, Output]]:
         """Stream the log into the signal tables; nothing appears unless the whole log came through."""
@@ -271,10 +281,7 @@ class FlightWork:
 
     def _read_again(self) -> None:
         """Read the log once more: readings that are needed were removed."""
-        try:
-            self._write_signals(whole=False)
-        except Disordered:
-            self._write_signals(whole=True)
+        self._read()
 
     # --- stages
 

@@ -9,6 +9,7 @@ import shutil
 import stat
 import sys
 import tempfile
+import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,7 @@ LEAST_FREE_BYTES = 200 << 20
 LITTLE_FREE_BYTES = 2 << 30
 LEAST_FILES_OPEN = 256
 LEAST_PYTHON = (3, 11)
+WIDTH = 80
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,23 @@ def examine(root: Path, archive: Path | None = None, config: Path | None = None)
         _server(root),
     ]
     return Examination(all(check.status != FAILED for check in checks), checks)
+
+
+def lines(result: Examination) -> Iterator[str]:
+    """What was looked at, a check a line or two; what is wrong says what to do."""
+    for check in result.checks:
+        head = f"{check.status:8} {check.check:14}"
+        yield from _wrapped(head, check.found)
+        if check.advice:
+            yield from _wrapped(" " * len(head), check.advice)
+
+
+def _wrapped(head: str, text: str) -> list[str]:
+    rest = " " * len(head)
+    wrapper = textwrap.TextWrapper(
+        WIDTH, initial_indent=head, subsequent_indent=rest, break_long_words=False, break_on_hyphens=False
+    )
+    return wrapper.wrap(text) or [head.rstrip()]
 
 
 def _versions() -> Iterator[Check]:

@@ -5,29 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import fieldcal
-from fieldcal.cli.options import AsCsv, AsJson, Root, UnusedConfig
-
-SHOWN = (
-    "vehicle_id",
-    "unit_id",
-    "sensor",
-    "method",
-    "parameter",
-    "axis",
-    "status",
-    "n_flights",
-    "value_at_25degc",
-    "sd",
-    "slope_per_degc",
-    "slope_per_degc_sd",
-    "slope_per_day",
-    "slope_per_day_sd",
-    "unit",
-    "last_z",
-    "fleet_z",
-    "change_at",
-    "reason",
-)
+from fieldcal.cli.options import AsCsv, AsJson, Root, UnusedConfig, Wide
 
 
 def drift(
@@ -35,6 +13,7 @@ def drift(
     vehicle: str | None = None,
     sensor: Literal["magnetometer", "accelerometer", "gyroscope", "vps", "fit"] | None = None,
     parameter: str | None = None,
+    wide: Wide = False,
     as_json: AsJson = False,
     as_csv: AsCsv = False,
     warehouse: Root = None,
@@ -51,8 +30,18 @@ def drift(
     parameter
         scale, bias, zero, zero_bias, lag, skew, tic_attitude, ...
     """
+    from fieldcal.cli.present.drift import print_drift
+    from fieldcal.cli.present.history import as_written
+    from fieldcal.cli.present.screen import console
     from fieldcal.cli.show import print_frame
 
     rows = fieldcal.Warehouse(warehouse).drift(vehicle=vehicle, sensor=sensor, parameter=parameter)
-    print_frame(rows if as_json or as_csv else rows.select(SHOWN), as_json=as_json, as_csv=as_csv)
+    if as_json or as_csv:
+        print_frame(rows, as_json=as_json, as_csv=as_csv)
+    elif wide:
+        print_frame(as_written(rows, "value_at_25degc"), as_json=False, as_csv=False, wide=True)
+    else:
+        from fieldcal.report.standing.memory import following
+
+        print_drift(console(), rows, following(fieldcal.Warehouse(warehouse).root, rows["vehicle_id"].unique()))
     return 0

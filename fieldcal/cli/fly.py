@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 import fieldcal
-from fieldcal.cli.options import AsJson, Config, Output, Root, UnusedConfig, Whole
+from fieldcal.cli.options import AsJson, Config, Output, Place, Root, UnusedConfig, Whole, Wide
 from fieldcal.reason_codes import ReasonCode
 
 Format = Literal["px4", "ardupilot", "ros", "imu_calib", "imu_pipeline", "kalibr", "json", "c"]
@@ -56,6 +56,7 @@ def export(
         File to write; else stdout.
     """
     from fieldcal.exports import AUTOPILOTS
+    from fieldcal.remote.url import RemoteError
     from fieldcal.warehouse.files import write_bytes
     from fieldcal.words.talk import say
 
@@ -74,7 +75,7 @@ def export(
         write_bytes(output, result.text.encode())
     try:
         root.record_export(constants, to, result, author=author, temperature_degc=at_temperature)
-    except fieldcal.WarehouseError as error:
+    except (fieldcal.WarehouseError, RemoteError) as error:
         say(f"That it was exported is not remembered. {error}")
     return 0
 
@@ -86,6 +87,7 @@ def compare(
     params: Path | None = None,
     logged_raw: bool = False,
     at_temperature: float | None = None,
+    wide: Wide = False,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: UnusedConfig = None,
@@ -107,8 +109,9 @@ def compare(
     from dataclasses import asdict
 
     from fieldcal.api.constants import comparison
-    from fieldcal.cli.show import console, print_json, table
-    from fieldcal.exports.autopilots.comparison import COLUMNS, lines
+    from fieldcal.cli.present.compared import print_compared
+    from fieldcal.cli.present.screen import console
+    from fieldcal.cli.show import print_json
     from fieldcal.words.talk import say
 
     root = fieldcal.Warehouse(warehouse)
@@ -120,18 +123,19 @@ def compare(
         as_told = [(row, {k: None if v != v else v for k, v in asdict(row).items()}) for row in rows]
         print_json([{**cells, "exported": of.get((row.unit_id, row.sensor))} for row, cells in as_told])
         return 0
-    console().print(table(COLUMNS, lines(rows), title=f"{vehicle}: what it flies with, and what is estimated"))
+    screen = console(wide=wide)
+    print_compared(screen, rows, vehicle)
     for sentence in told:
         say(sentence)
     if none := sorted({row.sensor for row in rows if row.parameter == "zero" and row.estimate != row.estimate}):
-        print(f'Not estimated: {", ".join(none)}; `fieldcal sql "FROM refusals"` says why.')
+        screen.print(f'Not estimated: {", ".join(none)}; `fieldcal sql "FROM refusals"` says why.')
     for one in exports:
-        print(one.sentence)
+        screen.print(one.sentence)
     return 0
 
 
 def apply(
-    log: Path,
+    log: Place,
     /,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
@@ -156,10 +160,12 @@ def apply(
         °C; else each sample's own temperature, 25 where the log has none.
     """
     from fieldcal.cli.show import print_json
+    from fieldcal.remote.places import log_at
     from fieldcal.words.talk import say
 
-    _keep(log, output)
-    recording = fieldcal.read_log(log, config=config, vehicle=vehicle)
+    own = log_at(log)
+    _keep(own, output)
+    recording = fieldcal.read_log(own, config=config, vehicle=vehicle)
     constants = fieldcal.Warehouse(warehouse).calibration_at(recording.vehicle_id, at_temperature)
     calibrated = fieldcal.apply(recording, constants, follow_temperature=at_temperature is None)
     written, unsaid = calibrated.write(output)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fieldcal.cli.options import AsJson, Config, UnusedConfig, UnusedRoot
+from fieldcal.cli.options import AsJson, Config, Place, UnusedConfig, UnusedRoot
 from fieldcal.words.printable import printable
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ WIDTH = 80
 LABEL = 10
 
 
-def inspect(log: Path, /, *, as_json: AsJson = False, config: Config = None, warehouse: UnusedRoot = None) -> int:
+def inspect(log: Place, /, *, as_json: AsJson = False, config: Config = None, warehouse: UnusedRoot = None) -> int:
     """Show what is in a log, and what is unknown or assumed of it. Nothing is calibrated, nothing written.
 
     Parameters
@@ -31,8 +31,9 @@ def inspect(log: Path, /, *, as_json: AsJson = False, config: Config = None, war
     from fieldcal.cli.show import print_json
     from fieldcal.flight.inspection import inspect_log
     from fieldcal.names import Verdict
+    from fieldcal.remote.places import log_at
 
-    found = inspect_log(log, config)
+    found = inspect_log(log_at(log), config)
     if as_json:
         print_json(asdict(found))
     else:
@@ -41,7 +42,7 @@ def inspect(log: Path, /, *, as_json: AsJson = False, config: Config = None, war
 
 
 def init(
-    archive: Path, /, *, as_json: AsJson = False, config: UnusedConfig = None, warehouse: UnusedRoot = None
+    archive: Place, /, *, as_json: AsJson = False, config: UnusedConfig = None, warehouse: UnusedRoot = None
 ) -> int:
     """Write a commented fieldcal.toml for an archive from what lies in it; one that is there is left as it is.
 
@@ -54,9 +55,10 @@ def init(
 
     from fieldcal.cli.show import print_json
     from fieldcal.flight.first_configuration import first_configuration, write_first_configuration
+    from fieldcal.remote.places import folder_at
     from fieldcal.words.talk import say
 
-    first = first_configuration(archive)
+    first = first_configuration(folder_at(archive, "init"))
     if first.logs:
         write_first_configuration(first)
     if as_json:

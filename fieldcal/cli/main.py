@@ -18,7 +18,19 @@ from fieldcal.cli.fly import apply, compare, export
 from fieldcal.cli.interrupt import interruptible
 from fieldcal.cli.look import init, inspect
 from fieldcal.cli.onboard import onboard, refit
-from fieldcal.cli.options import AsCsv, AsJson, Config, DryRun, Root, Runner, Scheduler, SessionFolder, Workers
+from fieldcal.cli.options import (
+    AsCsv,
+    AsJson,
+    Config,
+    DryRun,
+    Place,
+    Root,
+    Runner,
+    Scheduler,
+    SessionFolder,
+    Wide,
+    Workers,
+)
 from fieldcal.cli.pooled import plan, pooled
 from fieldcal.cli.report import report as report_command
 from fieldcal.cli.report import site
@@ -63,12 +75,12 @@ def demo(folder: Path = Path("fieldcal-demo"), /, *, warehouse: Root = None, con
     """
     from fieldcal.cli.present.demo import run_demo
 
-    return LOSSES if run_demo(folder, warehouse or folder / "fieldcal-data", config) else OK
+    return LOSSES if run_demo(folder, _root(warehouse or str(folder / "fieldcal-data")), config) else OK
 
 
 @app.command
 def calibrate(
-    log: Path,
+    log: Place,
     /,
     *,
     vehicle: str | None = None,
@@ -77,6 +89,7 @@ def calibrate(
     unit: str = "imu",
     set_: Annotated[list[str] | None, Parameter(name="--set")] = None,
     report: Annotated[Path | None, Parameter(help="Write the flight's report to this HTML file too.")] = None,
+    wide: Wide = False,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -98,7 +111,7 @@ def calibrate(
     set_
         Overrule a stage parameter: --set smoothing_cutoff_hz=6.
     """
-    from fieldcal.cli.show import console, print_json
+    from fieldcal.cli.show import print_json
     from fieldcal.words.talk import say
 
     changes = _assignments(set_ or [])
@@ -111,20 +124,22 @@ def calibrate(
         print_json(result.document)
     else:
         from fieldcal.cli.present.flight import print_flight
+        from fieldcal.cli.present.screen import console
 
-        print_flight(console(), result.document)
+        print_flight(console(wide=wide), result.document, result.nominal_scale, wide=wide)
     return OK if result.verdict == Verdict.OK else LOSSES
 
 
 @app.command
 def nightly(
-    archive: Path,
+    archive: Place,
     /,
     *,
     workers: Workers = 1,
     runner: Runner = "process",
     scheduler: Scheduler = None,
     dry_run: DryRun = False,
+    wide: Wide = False,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -134,11 +149,12 @@ def nightly(
     Parameters
     ----------
     archive
-        Folder of logs: ARCHIVE/<vehicle>/<session>/<log>.
+        Folder of logs: ARCHIVE/<vehicle>/<session>/<log>; or its URL in an object store (s3://, gs://, az://).
     """
-    _need_folder(archive, ReasonCode.NO_ARCHIVE, "archive")
+    from fieldcal.remote.places import archive_at
+
     where = {"runner": runner, "scheduler": scheduler}
-    return _night(archive.absolute(), None, workers, where, dry_run, as_json, warehouse, config)
+    return _night(archive_at(archive), None, workers, where, (dry_run, as_json, wide), warehouse, config)
 
 
 @app.command
@@ -150,6 +166,7 @@ def session(
     runner: Runner = "process",
     scheduler: Scheduler = None,
     dry_run: DryRun = False,
+    wide: Wide = False,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -159,12 +176,13 @@ def session(
     Parameters
     ----------
     folder
-        Folder of the session: ARCHIVE/<vehicle>/<session>.
+        Folder of the session: ARCHIVE/<vehicle>/<session>, or its URL.
     """
-    _need_folder(folder, ReasonCode.NO_SESSION, "session folder")
-    own = folder.absolute()
+    from fieldcal.remote.places import session_at
+
+    archive, own = session_at(folder)
     where = {"runner": runner, "scheduler": scheduler}
-    return _night(own.parent.parent, own, workers, where, dry_run, as_json, warehouse, config)
+    return _night(archive, own, workers, where, (dry_run, as_json, wide), warehouse, config)
 
 
 @app.command
@@ -174,6 +192,7 @@ def history(
     sensor: Literal["magnetometer", "accelerometer", "gyroscope"] | None = None,
     parameter: str | None = None,
     since: str | None = None,
+    wide: Wide = False,
     as_json: AsJson = False,
     as_csv: AsCsv = False,
     warehouse: Root = None,
@@ -190,19 +209,28 @@ def history(
     since
         Only flights that started then or later: 2026-05-04 or 2026-05-04T12:00.
     """
+    from fieldcal.cli.present.history import as_written, print_history
+    from fieldcal.cli.present.screen import console
     from fieldcal.cli.show import print_frame
 
     rows = fieldcal.Warehouse(warehouse).history(vehicle=vehicle, sensor=sensor, parameter=parameter, since=since)
-    whole = as_json or as_csv
-    usual = [("unit_id", rows["unit_id"].equals(rows["imu_id"])), ("dated_by", (rows["dated_by"] == "log").all())]
-    hidden = ["imu_id", "session_id", "flight_id", *(name for name, is_usual in usual if is_usual)]
-    print_frame(rows if whole else rows.drop(hidden), as_json=as_json, as_csv=as_csv)
+    if wide or as_json or as_csv:
+        print_frame(as_written(rows) if not (as_json or as_csv) else rows, as_json=as_json, as_csv=as_csv, wide=True)
+    else:
+        print_history(console(), rows)
     return OK
 
 
 @app.command
 def sql(
-    query: str, /, *, as_json: AsJson = False, as_csv: AsCsv = False, warehouse: Root = None, config: Config = None
+    query: str,
+    /,
+    *,
+    wide: Wide = False,
+    as_json: AsJson = False,
+    as_csv: AsCsv = False,
+    warehouse: Root = None,
+    config: Config = None,
 ) -> int:
     """Answer one SELECT over the tables and views; it can only read.
 
@@ -213,14 +241,14 @@ def sql(
     """
     from fieldcal.cli.show import print_frame
 
-    print_frame(fieldcal.Warehouse(warehouse).sql(query), as_json=as_json, as_csv=as_csv)
+    print_frame(fieldcal.Warehouse(warehouse).sql(query), as_json=as_json, as_csv=as_csv, wide=wide)
     return OK
 
 
 @app.command
 def verify(
     *,
-    archive: Path | None = None,
+    archive: Place | None = None,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -234,12 +262,16 @@ def verify(
     """
     from fieldcal.cli.show import print_json
     from fieldcal.logs import log_sha256
+    from fieldcal.remote.content import here
+    from fieldcal.remote.places import archive_at
     from fieldcal.warehouse.upkeep.verify import verify as check
     from fieldcal.words.talk import say
 
-    if archive is not None:
-        _need_folder(archive, ReasonCode.NO_ARCHIVE, "archive")
-    result = check(_root(warehouse), archive, log_sha256)
+    def sha256_of(log: Path) -> str:
+        with here(log):
+            return log_sha256(log)
+
+    result = check(_root(warehouse), None if archive is None else archive_at(archive), sha256_of)
     if as_json:
         print_json(result)
     else:
@@ -277,7 +309,7 @@ def upgrade(*, dry_run: DryRun = False, as_json: AsJson = False, warehouse: Root
 @app.command
 def doctor(
     *,
-    archive: Path | None = None,
+    archive: Place | None = None,
     as_json: AsJson = False,
     warehouse: Root = None,
     config: Config = None,
@@ -291,21 +323,37 @@ def doctor(
     """
     from dataclasses import asdict
 
-    from fieldcal.cli.doctor import examine
+    from fieldcal.cli.doctor import examine, lines
     from fieldcal.cli.show import print_json
+    from fieldcal.remote.places import folder_at
 
-    result = examine(_root(warehouse), archive, config)
+    result = examine(_root(warehouse), folder_at(archive, "doctor --archive") if archive else None, config)
     if as_json:
         print_json(asdict(result))
     else:
-        for check in result.checks:
-            advice = f"\n{'':23}{check.advice}" if check.advice else ""
-            print(printable(f"{check.status:8} {check.check:14}{check.found}{advice}"))
+        for line in lines(result):
+            print(printable(line))
     return OK if result.ok else FAILED
+
+
+@app.command
+def completion(shell: Literal["bash", "zsh", "fish"], /) -> int:
+    """Print what makes a shell complete commands, options and their values.
+
+    Parameters
+    ----------
+    shell
+        Whose: fieldcal completion bash > ~/.local/share/bash-completion/completions/fieldcal
+    """
+    print(app.generate_completion(shell=shell))
+    return OK
 
 
 def main(tokens: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
+    from fieldcal.cli.present.characters import settle
+
+    settle(sys.stdout)
     # Processes started from here must not take what lies in the current folder for a module.
     os.environ.setdefault("PYTHONSAFEPATH", "1")
     sys.exit(run(sys.argv[1:] if tokens is None else tokens))
@@ -355,15 +403,15 @@ def _night(
     folder: Path | None,
     workers: int,
     where: dict[str, str | None],
-    dry: bool,
-    as_json: bool,
-    warehouse: Path | None,
+    how: tuple[bool, bool, bool],
+    warehouse: str | None,
     config: Path | None,
 ) -> int:
-    from fieldcal.cli.show import console, print_json
+    from fieldcal.cli.show import print_json
     from fieldcal.flows.run import dry_run as plan_only
     from fieldcal.flows.run import run_night
 
+    dry, as_json, wide = how
     if workers < 1:
         raise _usage(ReasonCode.WRONG_OPTION, "--workers must be 1 or more.")
     root = _root(warehouse)
@@ -373,8 +421,9 @@ def _night(
             print_json(plan)
         else:
             from fieldcal.cli.present.night import print_plan
+            from fieldcal.cli.present.screen import console
 
-            print_plan(console(), plan)
+            print_plan(console(wide=wide), plan)
         return OK
     from fieldcal.cli.present.progress import NightProgress
 
@@ -384,20 +433,16 @@ def _night(
         print_json(result)
     else:
         from fieldcal.cli.present.night import print_night
+        from fieldcal.cli.present.screen import console
 
-        print_night(console(), result, root)
+        print_night(console(wide=wide), result, root)
     return OK if result["ok"] == len(result["logs"]) else LOSSES
 
 
-def _root(warehouse: Path | None) -> Path:
+def _root(warehouse: str | None) -> Path:
     from fieldcal.warehouse import Warehouse
 
     return Warehouse(warehouse).root
-
-
-def _need_folder(folder: Path, reason_code: ReasonCode, what: str) -> None:
-    if not folder.is_dir():
-        raise _usage(reason_code, f"There is no {what} at {folder}.")
 
 
 def _usage(reason_code: ReasonCode, sentence: str) -> Exception:

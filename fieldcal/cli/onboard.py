@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import fieldcal
-from fieldcal.cli.options import AsCsv, AsJson, Config, Root, UnusedRoot
+from fieldcal.cli.options import AsCsv, AsJson, Config, Root, UnusedRoot, Wide
 from fieldcal.reason_codes import ReasonCode
 
 
@@ -62,6 +62,7 @@ def refit(
     sessions: str | None = None,
     dump: Annotated[list[Path] | None, Parameter(help="A dump that was collected on board; may be repeated.")] = None,
     full: bool = False,
+    wide: Wide = False,
     as_json: AsJson = False,
     as_csv: AsCsv = False,
     warehouse: Root = None,
@@ -78,6 +79,8 @@ def refit(
     full
         Symmetric scale matrices instead of three scales.
     """
+    from fieldcal.cli.present.history import as_written, print_constants
+    from fieldcal.cli.present.screen import console
     from fieldcal.cli.show import print_frame
     from fieldcal.exports.refit import frame_of
     from fieldcal.words.talk import say
@@ -88,5 +91,11 @@ def refit(
     for one in found:
         flights = "1 flight" if one.n_flights == 1 else f"{one.n_flights} flights"
         say(f"{one.sensor.capitalize()} of {one.unit_id}: {flights}, {one.n_samples} samples.")
-    print_frame(frame_of(found), as_json=as_json, as_csv=as_csv)
+    rows = frame_of(found)
+    if as_json or as_csv:
+        print_frame(rows, as_json=as_json, as_csv=as_csv)
+    elif wide:
+        print_frame(as_written(rows), as_json=False, as_csv=False, wide=True)
+    else:
+        print_constants(console(), rows)
     return 0

@@ -22,15 +22,19 @@ Whole = Annotated[int, Parameter(converter=_whole)]
 Config = Annotated[Path | None, Parameter(help="fieldcal.toml to use; else the archive's own, if it has one.")]
 UnusedConfig = Annotated[Path | None, Parameter(show=False)]
 """Every command takes `--config`; these need nothing of it."""
+Place = str
+"""A path, or a URL, in which a path would lose a slash."""
 Root = Annotated[
-    Path | None, Parameter(name="--warehouse", help="Data root; else FIELDCAL_WAREHOUSE, else ./fieldcal-data.")
+    Place | None,
+    Parameter(name="--warehouse", help="Data root or its URL; else FIELDCAL_WAREHOUSE, else ./fieldcal-data."),
 ]
-UnusedRoot = Annotated[Path | None, Parameter(show=False)]
+UnusedRoot = Annotated[Place | None, Parameter(show=False)]
 AsJson = Annotated[bool, Parameter(name="--json", negative="", help="One JSON document on stdout.")]
 AsCsv = Annotated[bool, Parameter(name="--csv", negative="", help="CSV on stdout.")]
+Wide = Annotated[bool, Parameter(name="--wide", negative="", help="All rows and columns, as wide as they are.")]
 DryRun = Annotated[bool, Parameter(help="List what would run; change nothing.")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
-SessionFolder = Annotated[Path, Parameter(name="SESSION_DIR")]
+SessionFolder = Annotated[Place, Parameter(name="SESSION_DIR")]
 Workers = Annotated[int, Parameter(converter=_whole, help="Processes that calibrate; results do not depend on it.")]
 Runner = Annotated[
     Literal["process", "dask", "pool"],

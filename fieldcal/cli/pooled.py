@@ -6,10 +6,7 @@ from __future__ import annotations
 from typing import Literal
 
 import fieldcal
-from fieldcal.cli.options import AsCsv, AsJson, Root, UnusedConfig
-
-MOST_SHOWN = 6
-"""Constants beside the best manoeuvre, those that it helps most first."""
+from fieldcal.cli.options import AsCsv, AsJson, Root, UnusedConfig, Wide
 
 SHOWN = (
     "vehicle_id",
@@ -37,6 +34,7 @@ def pooled(
     sensor: Literal["magnetometer", "accelerometer", "gyroscope"] | None = None,
     parameter: str | None = None,
     flights: bool = False,
+    wide: Wide = False,
     as_json: AsJson = False,
     as_csv: AsCsv = False,
     warehouse: Root = None,
@@ -58,6 +56,9 @@ def pooled(
     """
     import polars as pl
 
+    from fieldcal.cli.present.history import as_written
+    from fieldcal.cli.present.pooled import print_pooled
+    from fieldcal.cli.present.screen import console
     from fieldcal.cli.show import print_frame
 
     rows = fieldcal.Warehouse(warehouse).pooled(vehicle=vehicle, sensor=sensor, parameter=parameter)
@@ -66,13 +67,26 @@ def pooled(
         each = rows.select(*place, "flights", "shares", "left_out").explode("flights", "shares")
         out = pl.col("left_out").list.contains(pl.col("flights"))
         shown = each.select(*place, flight_id="flights", share="shares", left_out=out)
-        print_frame(shown, as_json=as_json, as_csv=as_csv)
+        print_frame(shown, as_json=as_json, as_csv=as_csv, wide=wide)
         return 0
-    print_frame(rows if as_json else rows.select(SHOWN), as_json=as_json, as_csv=as_csv)
+    if as_json or as_csv:
+        print_frame(rows if as_json else rows.select(SHOWN), as_json=as_json, as_csv=as_csv)
+    elif wide:
+        print_frame(as_written(rows.select(SHOWN), "value_at_25degc"), as_json=False, as_csv=False, wide=True)
+    else:
+        print_pooled(console(), rows)
     return 0
 
 
-def plan(vehicle: str, /, *, as_json: AsJson = False, warehouse: Root = None, config: UnusedConfig = None) -> int:
+def plan(
+    vehicle: str,
+    /,
+    *,
+    wide: Wide = False,
+    as_json: AsJson = False,
+    warehouse: Root = None,
+    config: UnusedConfig = None,
+) -> int:
     """What to fly next: the manoeuvre that would help most, and the standard deviations to expect after it.
 
     Parameters
@@ -82,19 +96,13 @@ def plan(vehicle: str, /, *, as_json: AsJson = False, warehouse: Root = None, co
     """
     from dataclasses import asdict
 
+    from fieldcal.cli.present.pooled import print_plan
+    from fieldcal.cli.present.screen import console
     from fieldcal.cli.show import print_json
 
     found = fieldcal.Warehouse(warehouse).plan(vehicle)
     if as_json:
         print_json(asdict(found))
-        return 0
-    best = found.manoeuvres[0]
-    print(f"{found.vehicle_id} ({found.unit_id}): {best.words}.")
-    print(f"Constants not known well enough: {best.refused_now} now, {best.refused_after} after it.")
-    for one in sorted(best.expected, key=lambda e: -(min(e.sd_now, 1e9) / e.sd_after))[:MOST_SHOWN]:
-        now = "not known" if one.sd_now == float("inf") else f"sd {one.sd_now:.2g} {one.unit}"
-        after = "not known" if one.sd_after == float("inf") else f"{one.sd_after:.2g} {one.unit}"
-        print(f"  {one.constant}: {now} → {after} (limit {one.limit:.2g} {one.unit})")
-    for other in found.manoeuvres[1:]:
-        print(f"Or {other.words}: {other.refused_after} not known well enough, sd smaller by {other.gain:.2f}.")
+    else:
+        print_plan(console(wide=wide), found)
     return 0

@@ -62,10 +62,12 @@ def site(*, as_json: AsJson = False, warehouse: Root = None, config: UnusedConfi
     from fieldcal.warehouse import Warehouse
     from fieldcal.warehouse.lock import fleet_lock
     from fieldcal.warehouse.questions import existing
+    from fieldcal.warehouse.remote.share import share
 
     root = existing(Warehouse(warehouse).root).root
     with fleet_lock(root):
         path = write_site(root)
+        share(root)
     if as_json:
         print_json({"path": str(path)})
     else:

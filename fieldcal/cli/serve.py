@@ -7,7 +7,7 @@ from pathlib import Path
 
 from cyclopts import App
 
-from fieldcal.cli.options import AsJson, Config, Root, SessionFolder, UnusedRoot, Whole
+from fieldcal.cli.options import AsJson, Config, Place, Root, SessionFolder, UnusedRoot, Whole
 from fieldcal.reason_codes import ReasonCode
 
 alerts_app = App(name="alerts", help="Whom nights tell what is new ([alerts] to in fieldcal.toml).")
@@ -15,12 +15,12 @@ EVERY_NIGHT = "0 3 * * *"
 
 
 def serve(
-    archive: Path | None = None,
+    archive: Place | None = None,
     /,
     *,
     cron: str = EVERY_NIGHT,
     timezone: str | None = None,
-    watch: Path | None = None,
+    watch: Place | None = None,
     quiet: float = 60.0,
     workers: Whole = 1,
     warehouse: Root = None,
@@ -47,12 +47,14 @@ def serve(
     from fieldcal.errors import FieldcalError
     from fieldcal.flows.connection import SECRET_FILE
     from fieldcal.flows.server import running_server
+    from fieldcal.remote.places import folder_at
     from fieldcal.warehouse import Warehouse
     from fieldcal.warehouse.layout import prepare
     from fieldcal.words.talk import say
 
-    place = archive or watch or (config.parent if config else Path())
-    for what, folder in (("archive", place), ("archive to watch", watch)):
+    watched = folder_at(watch, "serve --watch") if watch else None
+    place = folder_at(archive, "serve") if archive else watched or (config.parent if config else Path())
+    for what, folder in (("archive", place), ("archive to watch", watched)):
         if folder is not None and not folder.is_dir():
             raise FieldcalError(ReasonCode.NO_ARCHIVE, f"There is no {what} at {folder}.")
     find_source(config, place)
@@ -69,7 +71,7 @@ def serve(
         with server.explained():
             tidy_prefect(root, url, own_server=server.own)
         try:
-            runner = register(Served(place, watch, root, config, workers), cron, timezone)
+            runner = register(Served(place, watched, root, config, workers), cron, timezone)
         except ValueError as error:
             raise FieldcalError(ReasonCode.WRONG_OPTION, f'--cron "{cron}", --timezone: {_last_line(error)}') from error
         when = f'"{cron}" ({timezone or local_timezone()})'
@@ -79,7 +81,7 @@ def serve(
             keep_tidy(root, url)
             end_with_server(server.lives, _lost(server.home))
             say(f"The server's secret, for those who emit events or open its pages: {server.home / SECRET_FILE}")
-        host(runner, url, watch.absolute() if watch else None, quiet)
+        host(runner, url, watched.absolute() if watched else None, quiet)
     return 0
 
 
@@ -102,14 +104,16 @@ def trigger(
     from fieldcal.errors import FieldcalError
     from fieldcal.flows.trigger import server_address
     from fieldcal.flows.trigger import trigger as ask
+    from fieldcal.remote.places import folder_at
     from fieldcal.warehouse import Warehouse
 
-    if not folder.is_dir():
+    own = folder_at(folder, "trigger")
+    if not own.is_dir():
         raise FieldcalError(ReasonCode.NO_SESSION, f"There is no session folder at {folder}.")
     root = Warehouse(warehouse).root
     url = server_address(root)
-    changes = {"warehouse": warehouse, "config": config}
-    asked = ask(url, folder.absolute(), **{name: str(path.absolute()) for name, path in changes.items() if path})
+    changes = {"warehouse": str(root.absolute()) if warehouse else None, "config": config and str(config.absolute())}
+    asked = ask(url, own.absolute(), **{name: path for name, path in changes.items() if path})
     if as_json:
         print_json(asked)
     else:

@@ -29,6 +29,7 @@ def simulate(
     vehicles: Whole = 1,
     sessions: Whole = 1,
     flights: Whole = 1,
+    first: str | None = None,
     duration: float | None = None,
     translation_rms: float = 0.0,
     lever_arm: str = "0,0,0",
@@ -66,6 +67,8 @@ def simulate(
         One MCAP file a flight, a folder of CSVs, or one ULog file.
     vehicles, sessions, flights
         How many vehicles, sessions of each, flights in each.
+    first
+        When the first flight starts, 2026-05-04 or 2026-05-04T12:00 (UTC); else 2026-01-12T08:00.
     duration
         Seconds; of the manoeuvre 40, of an ordinary flight 120.
     translation_rms
@@ -135,8 +138,11 @@ def simulate(
     ):
         if not 0 <= share < 1:
             raise _wrong(f"{name} is a share: from 0 to below 1.")
+    from fieldcal.warehouse.questions import moment_of
+
+    dated = {} if first is None else {"first": moment_of("--first", first)}
     logs = fieldcal.write_flights(
-        folder, experiment, vehicles=vehicles, sessions=sessions, flights=flights, log_format=log_format
+        folder, experiment, vehicles=vehicles, sessions=sessions, flights=flights, log_format=log_format, **dated
     )
     if as_json:
         print_json({"folder": str(folder), "logs": [str(log) for log in logs]})

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import fieldcal
-from fieldcal.cli.options import AsJson, Root, UnusedConfig
+from fieldcal.cli.options import AsJson, Root, UnusedConfig, Wide
 from fieldcal.reason_codes import ReasonCode
 
 
@@ -39,12 +39,17 @@ def prune(
     from fieldcal.cli.show import print_json
     from fieldcal.warehouse.lock import fleet_lock
     from fieldcal.warehouse.questions import existing, moment_of
-    from fieldcal.warehouse.upkeep.prune import all_results, former_results, of_vehicle, remove
+    from fieldcal.warehouse.remote.garbage import Garbage, garbage
+    from fieldcal.warehouse.upkeep.prune import Removable, all_results, former_results, of_vehicle, remove
     from fieldcal.warehouse.upkeep.prune import signals_before as old_signals
 
     root = existing(fieldcal.Warehouse(warehouse).root).root
     removable = [all_results(root) if stages else former_results(root)]
+    former = garbage(root)
     if signals_before is not None:
+        if former is not None:
+            told = "--signals-before is for a warehouse on this machine; by URL readings stay."
+            raise fieldcal.FieldcalError(ReasonCode.WRONG_OPTION, told)
         moment = moment_of("--signals-before", signals_before)
         if moment > datetime.now(UTC):
             told = f"--signals-before {signals_before} has not come yet."
@@ -52,16 +57,15 @@ def prune(
         removable.append(old_signals(root, moment))
     if vehicle is not None:
         removable.append(of_vehicle(root, vehicle))
-    told_of = [
-        {"what": one.what, "lost": one.lost, "files": len(one.files), "bytes": one.size_bytes} for one in removable
-    ]
-    lines = [
-        f"{one.what}: {len(one.files)} files, {one.size_bytes / 1e6:.1f} MB. Lost is {one.lost}." for one in removable
-    ]
+    every: list[Removable | Garbage] = [*removable, *([former] if former is not None else [])]
+    told_of = [{"what": one.what, "lost": one.lost, "files": len(one.files), "bytes": one.size_bytes} for one in every]
+    lines = [f"{one.what}: {len(one.files)} files, {one.size_bytes / 1e6:.1f} MB. Lost is {one.lost}." for one in every]
     if yes:
         with fleet_lock(root):
             for one in removable:
                 remove(root, one)
+            if former is not None:
+                former.remove()
     if as_json:
         print_json({"removed": yes, "what": told_of})
         return 0
@@ -71,7 +75,7 @@ def prune(
     return 0
 
 
-def schemas(name: str | None = None, /, *, as_json: AsJson = False, markdown: bool = False) -> int:
+def schemas(name: str | None = None, /, *, wide: Wide = False, as_json: AsJson = False, markdown: bool = False) -> int:
     """The tables and views that can be asked: columns with type, unit and meaning.
 
     Parameters
@@ -81,7 +85,8 @@ def schemas(name: str | None = None, /, *, as_json: AsJson = False, markdown: bo
     markdown
         As Markdown, whole.
     """
-    from fieldcal.cli.show import console, print_json, table
+    from fieldcal.cli.present.screen import console, table
+    from fieldcal.cli.show import print_json
     from fieldcal.warehouse.questions import nearest
     from fieldcal.warehouse.reference import markdown as as_markdown
     from fieldcal.warehouse.reference import relations
@@ -99,13 +104,13 @@ def schemas(name: str | None = None, /, *, as_json: AsJson = False, markdown: bo
         lines = [
             [one.name, one.kind, one.meaning.partition(". ")[0].partition(": ")[0].removesuffix(".")] for one in asked
         ]
-        console().print(table(["name", "kind", "what"], lines))
+        console(wide=wide).print(table(["name", "kind", "what"], lines))
         print("fieldcal schemas NAME: its columns.")
     else:
         (one,) = asked
-        console().print(f"{one.name} ({one.kind}): {one.meaning}", markup=False)
+        console(wide=wide).print(f"{one.name} ({one.kind}): {one.meaning}", markup=False)
         lines = [[f"{c.name} *" if c.key else c.name, c.type, c.unit, c.meaning] for c in one.columns]
-        console().print(table(["column", "type", "unit", "meaning"], lines))
+        console(wide=wide).print(table(["column", "type", "unit", "meaning"], lines))
         if one.example:
             print(f'fieldcal sql "{one.example}"')
     return 0

@@ -262,12 +262,39 @@ class Alerts(Table):
     )
 
 
+class Site(Table):
+    """The site of linked pages."""
+
+    write: Annotated[bool, _meaning("whether each night brings it up to the history; fieldcal site does so anyway")] = (
+        True
+    )
+
+
 class Limits(Table):
     """What one log may take of the machine in a night, reading and all stages together. Results do not depend on it."""
 
     seconds: Annotated[Positive, _meaning("time after which the work on a log is ended", "s")] = 7200.0
     cpu_seconds: Annotated[Positive, _meaning("time of the processor after which it is ended", "s")] = 3600.0
     memory_mb: Annotated[Positive, _meaning("memory of its process beyond which it is ended", "MB")] = 8192.0
+
+
+class Tolerances(Table):
+    """By how much the constants that a vehicle flies with may be off before it is to be calibrated again. Results do
+    not depend on it; what is not given is not asked."""
+
+    gyroscope_degps: Annotated[Positive | None, _meaning("of a gyroscope's zero", "deg/s")] = None
+    accelerometer_mg: Annotated[Positive | None, _meaning("of an accelerometer's zero", "mg")] = None
+    magnetometer_ut: Annotated[Positive | None, _meaning("of a magnetometer's zero", "uT")] = None
+    heading_deg: Annotated[Positive | None, _meaning("of the heading by the magnetometer", "deg")] = None
+
+    @property
+    def given(self) -> bool:
+        """Whether there is any."""
+        return any(getattr(self, name) is not None for name in Tolerances.model_fields)
+
+
+class LimitsTable(Limits, Tolerances):
+    """`[limits]`: what one log may take of the machine in a night, and what a vehicle's constants may be off."""
 
 
 class Document(Table):
@@ -279,7 +306,8 @@ class Document(Table):
     vehicles: Annotated[dict[str, VehicleTable], _meaning("by the vehicle's folder")] = {}
     archive: Archive = Archive()
     alerts: Alerts = Alerts()
-    limits: Limits = Limits()
+    limits: LimitsTable = LimitsTable()
+    site: Site = Site()
 
 
 @dataclass(frozen=True)
@@ -305,9 +333,19 @@ class Configuration:
         return self.document.alerts
 
     @property
+    def writes_site(self) -> bool:
+        """Whether each night writes the site."""
+        return self.document.site.write
+
+    @property
     def limits(self) -> Limits:
         """What one log may take of the machine."""
-        return self.document.limits
+        return Limits(**{name: getattr(self.document.limits, name) for name in Limits.model_fields})
+
+    @property
+    def tolerances(self) -> Tolerances:
+        """By how much constants may be off."""
+        return Tolerances(**{name: getattr(self.document.limits, name) for name in Tolerances.model_fields})
 
     def vehicle(self, vehicle_id: str) -> Vehicle:
         """What is configured for `vehicle_id`."""

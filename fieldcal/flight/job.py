@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypedDict
 
+from fieldcal.remote.content import version_stamp
+
 STAMPS = 4
 """Numbers that tell a file from what it was: size first."""
 
@@ -60,6 +62,13 @@ class Job:
 
 
 def file_stamp(path: Path) -> tuple[int, ...]:
-    """Size, times of change and inode of a log's files: differs when somebody wrote to it."""
-    stats = [file.stat() for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
-    return tuple(value for stat in stats for value in (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino))
+    """Size, times of change and inode of a log's files, or the versions of those that an archive by URL lists: differs
+    when somebody wrote to it."""
+    return tuple(value for file in (sorted(path.iterdir()) if path.is_dir() else [path]) for value in _stamp(file))
+
+
+def _stamp(file: Path) -> tuple[int, ...]:
+    if (version := version_stamp(file)) is not None:
+        return version
+    stat = file.stat()
+    return stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino

@@ -14,9 +14,8 @@ from fieldcal.logs.on_board import PRIMARY, signals_of
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.pipeline import INGEST, PIPELINE
 from fieldcal.stages.stage import Stage, step_of
-from fieldcal.warehouse.layout import signal_path
 from fieldcal.warehouse.rows_as_json import digest
-from fieldcal.warehouse.signals import read_signal
+from fieldcal.warehouse.signals import has_signal, read_signal
 from fieldcal.warehouse.stage_store import StageStore, is_kept, outputs_of
 
 STAGES: dict[str, Stage] = {stage.name: stage for stage in PIPELINE}
@@ -76,7 +75,7 @@ class StageTables:
     def _read(self, stage: str, table: str) -> pl.DataFrame:
         if stage == INGEST:
             own = signals_of(self._unit, self._records[INGEST]["signals"])[table]
-            there = signal_path(self._root, own, self._vehicle_id, self._flight_id).exists()
+            there = has_signal(self._root, own, self._vehicle_id, self._flight_id)
             if not there and self._read_again is not None:
                 self._read_again()
             return read_signal(self._root, own, self._vehicle_id, self._flight_id)

@@ -18,6 +18,7 @@ from fieldcal.report.trend import change_sentence, worst_status
 from fieldcal.report.words import age, day, plain_name, with_unit
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.rows import DriftRow, FitRow, FlightRow
+from fieldcal.trends.reasons import status_words
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.questions import existing, units_flown
 from fieldcal.words.numbers import number
@@ -200,7 +201,7 @@ def _looks(drift: pl.DataFrame, links: Links) -> list[Part]:
                 links.to(vehicle_name(row["vehicle_id"]), row["vehicle_id"]),
                 row["unit_id"],
                 f"{plain_name(row['sensor'])} {row['parameter']} {row['axis']} ({plain_name(row['method'])})",
-                badge(row["status"]),
+                badge(row["status"], status_words(row)),
                 change_sentence(row, _siblings(drift, row) if row["status"] == DriftStatus.OUTLIER else []),
                 number(row["last_z"], 2),
             ]

@@ -75,6 +75,18 @@ def usable_flights(warehouse: Warehouse, vehicle_id: str | None = None) -> pl.Da
     )
 
 
+def last_usable(warehouse: Warehouse) -> pl.DataFrame:
+    """vehicle_id, imu_id, unit_id, sensor, last_at: latest flight with a time that calibrated each sensor."""
+    return (
+        warehouse.scan("calibration")
+        .filter((pl.col("status") == Status.OK) & pl.col("started_at").is_not_null())
+        .group_by("vehicle_id", "imu_id", "unit_id", "sensor")
+        .agg(last_at=pl.col("started_at").max())
+        .sort("vehicle_id", "imu_id", "unit_id", "sensor")
+        .collect()
+    )
+
+
 def as_of_sentence(as_of: datetime | None, given: bool) -> str:
     """What ages on the page count to."""
     if as_of is None:

@@ -138,10 +138,10 @@ def content(page: Page) -> dict[str, object]:
     }
 
 
-def badge(status: str | None) -> Markup:
-    """A status as a coloured word."""
+def badge(status: str | None, words: str | None = None) -> Markup:
+    """A status as a coloured word, or in `words`."""
     word = status or "unknown"
-    return Markup('<span class="badge {}">{}</span>').format(STATUS_KIND.get(word, "none"), printable(word))
+    return Markup('<span class="badge {}">{}</span>').format(STATUS_KIND.get(word, "none"), printable(words or word))
 
 
 def link(href: str, text: str) -> Markup:

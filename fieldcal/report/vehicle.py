@@ -33,6 +33,7 @@ from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.schemas.rows import DecisionRow, DriftRow, UnfoldedFlight
 from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
 from fieldcal.stages.beside.warm_up import PARAMETER as WARM_UP_SLOPE
+from fieldcal.trends.reasons import status_words
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.decisions.withdrawn import decisions
 from fieldcal.warehouse.questions import existing, known_vehicle, units_flown
@@ -218,7 +219,8 @@ def _trends(drift: pl.DataFrame, usable: int) -> list[Part]:
             Column("last flight, σ", "n"),
         )
         lines = [
-            [_name(r), r["axis"], badge(r["status"]), change_sentence(r, []), number(r["last_z"], 2)] for r in moving
+            [_name(r), r["axis"], badge(r["status"], status_words(r)), change_sentence(r, []), number(r["last_z"], 2)]
+            for r in moving
         ]
         parts.append(Table("Parameters that are not steady, worst first", columns, lines))
     elif not parts:
@@ -248,7 +250,7 @@ def _trend_table(caption: str, rows: Sequence[DriftRow]) -> Table:
         [
             _name(r),
             r["axis"],
-            badge(r["status"]),
+            badge(r["status"], status_words(r)),
             str(r["n_flights"]),
             scientific(r["value_at_25degc"], r["sd"]),
             scientific(r["slope_per_degc"], r["slope_per_degc_sd"]),

@@ -24,6 +24,8 @@ from fieldcal.simulation.experiment import Experiment, SimulatedFlight, constant
 from fieldcal.simulation.ordinary import ordinary_flight
 from fieldcal.stages.tables import AXES, QUATERNION, columns_of, triad
 
+DAYS_BETWEEN = 7
+"""Sessions of a vehicle."""
 FIRST_FLIGHT = datetime(2026, 1, 12, 8, 0, tzinfo=UTC)
 LATENCY_NS = {"imu": 400_000, "vps": 4_800_000, "gnss": 9_000_000}
 
@@ -36,6 +38,7 @@ def write_flights(
     sessions: int = 1,
     flights: int = 1,
     log_format: str = "mcap",
+    first: datetime = FIRST_FLIGHT,
 ) -> list[Path]:
     """Write an archive of simulated flights and return the logs, sorted.
 
@@ -54,6 +57,8 @@ def write_flights(
         How many vehicles, sessions of each, flights in each.
     log_format : {"mcap", "csv", "ulog"}
         One MCAP file, a folder with imu.csv and vps.csv, or one ULog file with PX4's raw topics.
+    first : datetime
+        When the first flight starts, with a time zone; default: 2026-01-12, 08:00 UTC.
 
     Raises
     ------
@@ -82,7 +87,7 @@ def write_flights(
     logs = []
     for v, (vehicle_id, own) in enumerate(flown.items()):
         for k in range(sessions):
-            day = FIRST_FLIGHT + timedelta(days=7 * k)
+            day = first + timedelta(days=DAYS_BETWEEN * k)
             session = folder / vehicle_id / f"{day:%Y-%m-%d}"
             session.mkdir(parents=True, exist_ok=True)
             for i in range(flights):

@@ -179,4 +179,6 @@ def with_standing(page: Page, one: Fitness, compare: str) -> Page:
     facts = [("standing", badge(one.standing)), *((name, value) for name, value in page.facts if name != "age")]
     facts.append(("beside others", link(compare, "compare")))
     lead = list(one.reasons) or ["Every trend with enough sessions is steady, and no constant has expired."]
+    lead += [sentence for sentence in (one.next, *(note.sentence for note in one.notes)) if sentence not in lead]
+    lead = [sentence for sentence in lead if sentence]
     return Page(page.title, lead, facts, page.sections, FOOTER, page.up)

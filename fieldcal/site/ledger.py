@@ -123,7 +123,7 @@ def folder(root: Path) -> Path:
 def vehicle_digest(snapshot: Snapshot, one: Fitness, code: str) -> str:
     """Digest of all that a vehicle's pages, its flights' too, show: by the records of what its history holds, and of
     that of others that carried its units."""
-    told = [code, one.standing, *one.reasons]
+    told = [code, one.standing, *one.reasons, *(note.sentence for note in one.notes), one.next]
     for vehicle_id in snapshot.sharing_units(one.vehicle_id):
         for table in HISTORY_TABLES:
             record = checksum_path(snapshot.root, history_path(snapshot.root, table, vehicle_id))

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fieldcal.config.configuration import Alerts
 from fieldcal.provenance.run_key import code_digest
-from fieldcal.report.fitness import Fitness, fleet_fitness, remembered_alerts
+from fieldcal.report.fitness import Criteria, Fitness, fleet_fitness
 from fieldcal.report.links import Links, flight_name, vehicle_name
+from fieldcal.report.standing.memory import remembered_criteria
 from fieldcal.site.fleet_pages import compare_page, fleet_data, fleet_page, flights_page
 from fieldcal.site.ledger import Ledger, Written, flight_digest, vehicle_digest
 from fieldcal.site.pages import ASSETS, DATA, Frame, asset, html
@@ -18,18 +18,19 @@ from fieldcal.site.snapshot import Snapshot
 from fieldcal.site.vehicle_pages import flight_files, vehicle_files
 from fieldcal.warehouse.layout import SITE, prepare
 from fieldcal.warehouse.questions import existing
+from fieldcal.warehouse.remote.pages import at_hand
 
 INDEX = "index.html"
 ALWAYS = f"{DATA}/fleet.js"
 
 
-def write_site(root: Path, alerts: Alerts | None = None, *, now: datetime | None = None) -> Path:
+def write_site(root: Path, criteria: Criteria | None = None, *, now: datetime | None = None) -> Path:
     """Bring the site up to the history; the path of its first page. The caller holds the fleet's lock.
 
     Parameters
     ----------
-    alerts
-        When a calibration has expired; else as in the last night.
+    criteria
+        By what vehicles are judged; else as in the last night.
     now
         Ages count to this moment.
 
@@ -39,9 +40,16 @@ def write_site(root: Path, alerts: Alerts | None = None, *, now: datetime | None
         `no_warehouse`; `damaged_file`; the disk's refusal.
     """
     existing(root)
-    prepare(root)
     snapshot = Snapshot(root)
-    fitness = fleet_fitness(snapshot, alerts or remembered_alerts(root), now or datetime.now(UTC))
+    return write_pages(
+        snapshot, fleet_fitness(snapshot, criteria or remembered_criteria(root), now or datetime.now(UTC))
+    )
+
+
+def write_pages(snapshot: Snapshot, fitness: Mapping[str, Fitness]) -> Path:
+    """The same, of what is judged already."""
+    root = snapshot.root
+    prepare(root)
     flights = snapshot.scan("flight").select("vehicle_id", "flight_id").collect()
     names = {INDEX, *(vehicle_name(one) for one in fitness), *(flight_name(one) for one in flights["flight_id"])}
     links = Links(root / SITE, frozenset(names), INDEX)
@@ -49,8 +57,10 @@ def write_site(root: Path, alerts: Alerts | None = None, *, now: datetime | None
     ledgers = Ledger.all_of(root)
     code = code_digest()
     for vehicle_id, one in fitness.items():
-        own = flights.filter(vehicle_id=vehicle_id)["flight_id"].to_list()
-        _vehicle(snapshot, one, own, links, ledgers.pop(vehicle_id, None), written, code)
+        ledger = ledgers.pop(vehicle_id, None) or Ledger(root, vehicle_id)
+        every = flights.filter(vehicle_id=vehicle_id)["flight_id"]
+        own = [flight for flight in every if flight in ledger.of_flights or at_hand(root, flight)]
+        _vehicle(snapshot, one, own, links, ledger, written, code)
     _fleet(snapshot, fitness, links, written)
     for ledger in ledgers.values():
         ledger.forget()
@@ -63,12 +73,11 @@ def _vehicle(
     one: Fitness,
     flights: list[str],
     links: Links,
-    ledger: Ledger | None,
+    ledger: Ledger,
     written: Written,
     code: str,
 ) -> None:
     """The vehicle's pages and its flights', where what they show, or the code that makes them, is another."""
-    ledger = ledger or Ledger(snapshot.root, one.vehicle_id)
     of = vehicle_digest(snapshot, one, code)
     if ledger.of == of and all(written.has(files) for files in (ledger.files, *ledger.of_flights.values())):
         written.keep(ledger)

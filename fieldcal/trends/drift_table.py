@@ -18,6 +18,7 @@ from fieldcal.trends import few_sessions, regression, siblings, temperatures
 from fieldcal.trends.curves import Bends, Bent, bends_of, bent
 from fieldcal.trends.evidence import evidence
 from fieldcal.trends.evidence_cache import Memory
+from fieldcal.trends.more_sessions import needed
 from fieldcal.trends.one_sensor import of_present_sensor, told
 from fieldcal.trends.reasons import AGREEMENT, VPS, reason
 from fieldcal.trends.series import Histories
@@ -106,7 +107,9 @@ def table_of(flights: pl.DataFrame, bends: Bends = NO_BENDS, memory: Memory | No
         best_known_at=_moments(trends.best_day),
         status=pl.Series(regression.statuses(trends, fleet_p).tolist(), dtype=pl.String),
     )
-    reasons = [reason(row) for row in typed(result.iter_rows(named=True), DriftRow)]
+    more = needed(trends)
+    rows_made = typed(result.iter_rows(named=True), DriftRow)
+    reasons = [reason(row, int(n)) for row, n in zip(rows_made, more, strict=True)]
     explained = told(result.with_columns(reason=pl.Series(reasons, dtype=pl.String)), exchanged)
     explained = temperatures.with_notes(explained, doubts)
     return explained.select(TABLES["drift"].column_names).sort(KEY)

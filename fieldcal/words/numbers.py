@@ -5,6 +5,9 @@ from __future__ import annotations
 from datetime import datetime
 from math import floor, log10
 
+SMALL, LARGE = 1e-3, 1e7
+"""Below the one, and from the other on, a power of ten is told beside the number."""
+
 
 def cell(value: object) -> str:
     """A value in a table."""
@@ -25,13 +28,21 @@ def number(value: float | None, digits: int = 5) -> str:
 
 
 def with_sd(value: float | None, sd: float | None) -> str:
-    """A value and its standard deviation, to the digits that the latter leaves."""
+    """A value and its standard deviation, to the two digits of the latter that say something.
+
+    Examples
+    --------
+    >>> with_sd(38480.3, 108.0), with_sd(0.70735, 0.0231), with_sd(1.43238e-4, 7.3e-8)
+    ('38480 ± 110', '0.707 ± 0.023', '(1.43238 ± 0.00073)e-4')
+    """
     if value is None:
         return "–"
-    if sd is None or not sd > 0:
+    if sd is None or not 0 < sd < float("inf"):
         return number(value)
+    largest = max(abs(value), sd)
+    power = floor(log10(largest)) if largest < SMALL or largest >= LARGE else 0
+    value, sd = value / 10.0**power, sd / 10.0**power
     places = 1 - floor(log10(sd))
-    places = 0 if -3 <= places < 0 else places
-    if 0 <= places <= 9:
-        return f"{value:.{places}f} ± {sd:.{places}f}"
-    return f"{number(value)} ± {number(sd, 2)}"
+    rounded = round(value, places) + 0.0  # no minus before nothing
+    text = f"{rounded:.{max(places, 0)}f} ± {round(sd, places):.{max(places, 0)}f}"
+    return f"({text})e{power}" if power else text

@@ -18,6 +18,7 @@ from fieldcal.batch.night import plan_night, publishings
 from fieldcal.batch.outcome import Outcome
 from fieldcal.provenance.run_key import code_digest
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.report.fitness import Criteria
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse import Warehouse
@@ -39,7 +40,7 @@ def night(archive: Path, root: Path) -> None:
     outcomes = flights(str(root), planned.source, missing, code_digest())["outcomes"] if missing else []
     for publishing in publishings(planned, [Outcome.of(plain) for plain in outcomes]):
         publishing.publish()
-    close_night(root, planned.configuration.alerts)
+    close_night(root, Criteria.of(planned.configuration))
 
 
 @pytest.fixture(scope="module")

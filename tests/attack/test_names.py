@@ -10,7 +10,8 @@ import polars as pl
 import pytest
 
 from fieldcal.cli.main import _told
-from fieldcal.cli.show import console, print_csv, print_frame, print_json
+from fieldcal.cli.present.screen import console
+from fieldcal.cli.show import print_csv, print_frame, print_json
 from fieldcal.report.page import Column, Page, Section, Table, Text, html
 from fieldcal.words.printable import csv_cell, printable
 from fieldcal.words.talk import say
@@ -28,7 +29,7 @@ def test_control_characters_are_written_out() -> None:
 def test_a_terminal_shows_them_written_out(capsys: pytest.CaptureFixture[str]) -> None:
     say(NAME)
     _told(NAME, 1)
-    console(plain_width=1000).print(f"log {NAME}", markup=False)
+    console(wide=True).print(f"log {NAME}", markup=False)
     print_frame(pl.DataFrame({"log\x1b": [NAME]}), as_json=False, as_csv=False)
     captured = capsys.readouterr()
     assert captured.out.count(SHOWN) == 2

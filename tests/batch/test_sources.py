@@ -13,6 +13,7 @@ from fieldcal.batch.closing import close_night
 from fieldcal.batch.sources import NAMES, TRENDS, know_sources, stage_source
 from fieldcal.batch.steps import STEPS
 from fieldcal.config.configuration import Alerts
+from fieldcal.report.fitness import Criteria
 from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.trends import drift_table
 
@@ -76,12 +77,12 @@ def test_trends_are_made_anew_for_their_own_code_alone(tmp_path: Path, monkeypat
 
     known = dict(sources.sources())
     monkeypatch.setattr(drift_table, "update_drift", counted)
-    close_night(tmp_path, Alerts())
-    close_night(tmp_path, Alerts())
+    close_night(tmp_path, Criteria(Alerts()))
+    close_night(tmp_path, Criteria(Alerts()))
     assert len(made) == 1
     monkeypatch.setattr(closing, "sources", lambda: {**known, "attitude": "changed"})
-    close_night(tmp_path, Alerts())
+    close_night(tmp_path, Criteria(Alerts()))
     assert len(made) == 1
     monkeypatch.setattr(closing, "sources", lambda: {**known, TRENDS: "changed"})
-    close_night(tmp_path, Alerts())
+    close_night(tmp_path, Criteria(Alerts()))
     assert len(made) == 2

@@ -6,6 +6,7 @@ import ast
 import csv
 import io
 import json
+import os
 import re
 import subprocess
 import sys
@@ -20,6 +21,8 @@ import fieldcal
 from fieldcal import schemas
 from fieldcal.cli.fly import Format
 from fieldcal.cli.main import run
+from fieldcal.cli.present.night import print_night
+from fieldcal.cli.present.screen import console
 from fieldcal.exports import FORMATS
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
@@ -94,6 +97,34 @@ def test_help_imports_nothing_heavy() -> None:
     assert told.stdout == "[]\n"
 
 
+COMPLETED = """
+source /dev/stdin
+asked() {
+  COMP_WORDS=(fieldcal "$@"); COMP_CWORD=$#; COMPREPLY=()
+  _fieldcal fieldcal "${COMP_WORDS[COMP_CWORD]}" "${COMP_WORDS[COMP_CWORD-1]}"
+  echo "${COMPREPLY[*]}"
+}
+asked nig; asked history --sens; asked drift --sensor gyro; asked alerts te; asked export v --format px
+"""
+
+
+def test_bash_completes_commands_options_and_their_values(capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    assert run(["completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    done = subprocess.run(["bash", "-c", COMPLETED], input=script, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["nightly", "--sensor", "gyroscope", "test", "px4"]
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells_are_completed_too(capsys: pytest.CaptureFixture[str], shell: str) -> None:
+    capsys.readouterr()
+    assert run(["completion", shell]) == 0
+    told = capsys.readouterr().out
+    assert "nightly" in told
+    assert "--sensor" in told or "-l sensor" in told
+
+
 def test_every_export_can_be_chosen() -> None:
     (documented,) = re.findall(r"to : \{(.*)\}", str(fieldcal.export.__doc__))
     assert get_args(Format) == tuple(FORMATS)
@@ -120,7 +151,7 @@ def test_calibrate_shows_a_table_to_people(capsys: pytest.CaptureFixture[str], l
     capsys.readouterr()
     assert run(["calibrate", str(log)]) == 0
     told = capsys.readouterr().out
-    for word in ("ok", "magnetometer", "gyroscope", "±", "TIC", "VPS clock: lag"):
+    for word in ("ok", "mag x", "gyro x", "°/s/count", "±", "TIC", "VPS clock: lag"):
         assert word in told
 
 
@@ -146,6 +177,11 @@ def test_a_rejected_log_is_told_and_ends_in_3(capsys: pytest.CaptureFixture[str]
 
 def test_the_night_as_json(capsys: pytest.CaptureFixture[str], archive: Path, warehouse: Path) -> None:
     found = document(capsys, "nightly", str(archive), "--warehouse", str(warehouse), "--json", code=3)
+    print_night(console(), found, warehouse)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("3 logs: 1 ok, 1 no_result, 1 rejected; 0 stages run")
+    assert lines[1] == "Fleet: 0 of 2 vehicles fine to fly"
+    assert [line for line in lines if len(line) > 80 and not line.startswith(("Report:", "Site:"))] == []
     counts = {"ok", "partial", "no_result", "quarantined", "rejected"}
     assert set(found) - counts - {"stages_run", "stages_cached", "seconds", "logs", "unread"} == {
         "stage_seconds",
@@ -177,6 +213,52 @@ def test_a_log_without_any_constant_is_told_with_the_motion_that_it_wanted(
     ]
 
 
+def test_every_table_fits_80_columns_and_breaks_no_number(
+    capsys: pytest.CaptureFixture[str], archive: Path, warehouse: Path, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(warehouse.parent)  # paths are long on their own account
+    at, place = ("--warehouse", warehouse.name), os.path.relpath(archive)
+    commands = [
+        ("calibrate", str(log)),
+        ("nightly", place, "--dry-run", *at),
+        ("history", *at),
+        ("drift", *at),
+        ("drift", "--sensor", "fit", *at),
+        ("sql", "SELECT * FROM latest_calibration", *at),
+        ("sql", "SELECT log_uri, reason FROM flight", *at),
+        ("refit", "--vehicle", "sim-1", *at),
+        ("schemas",),
+        ("schemas", "drift"),
+        ("doctor", "--archive", place, *at),
+        ("inspect", os.path.relpath(log)),
+    ]
+    numbers = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")
+    for command in commands:
+        capsys.readouterr()
+        assert run(command) in (0, 3)
+        told = capsys.readouterr().out
+        assert told
+        long = [line for line in told.splitlines() if len(line) > 80]
+        assert [line for line in long if not line.startswith("fieldcal sql ")] == [], command  # to be copied
+        if "±" not in told or command[0] not in ("history", "drift"):
+            continue
+        run([*command, "--wide"])
+        wide = capsys.readouterr().out
+        for line in filter(lambda line: "±" in line, told.splitlines()):
+            assert all(number in wide for number in numbers.findall(line)), line
+
+
+def test_wide_shows_everything(capsys: pytest.CaptureFixture[str], warehouse: Path) -> None:
+    capsys.readouterr()
+    rows = document(capsys, "drift", "--json", "--warehouse", str(warehouse))
+    assert run(["drift", "--wide", "--warehouse", str(warehouse)]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert set(told[1].split()) == {*rows[0], "written"}
+    assert len([line for line in told if "sim-1" in line]) == len(rows)
+    run(["sql", "FROM calibration", "--warehouse", str(warehouse)])
+    assert "Not shown:" in capsys.readouterr().out
+
+
 def test_the_history_in_three_forms(capsys: pytest.CaptureFixture[str], warehouse: Path) -> None:
     asked = ["history", "--warehouse", str(warehouse), "--sensor", "gyroscope", "--parameter", "scale"]
     rows = document(capsys, *asked, "--json")
@@ -187,7 +269,7 @@ def test_the_history_in_three_forms(capsys: pytest.CaptureFixture[str], warehous
     assert [float(row["value"]) for row in listed] == [row["value"] for row in rows]
     assert document(capsys, *asked, "--json", "--since", "2026-02-01") == []
     assert run(asked) == 0
-    assert "gyroscope" in capsys.readouterr().out
+    assert "gyro x scale" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("command", ["history", "drift"])

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 from pathlib import Path
 
 import pytest
 
 import fieldcal
-from fieldcal.cli.present.demo import beside_truth
+from fieldcal.cli.present.constants import constant
+from fieldcal.cli.present.demo import beside_truth, first_flight
 from fieldcal.names import SENSORS
 from fieldcal.schemas.rows import CalibrationRow
 from fieldcal.simulation.archive import Truth
+from fieldcal.words.measures import measure
 from fieldcal.words.rows import typed
 
 
@@ -25,30 +28,35 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[CalibrationRo
 
 
 def cells(rows: list[CalibrationRow], truth: Truth) -> list[list[str]]:
-    columns = [[str(cell) for cell in column.cells] for column in beside_truth(rows, truth, "flight").columns]
-    return [list(line) for line in zip(*columns, strict=True)]
+    return beside_truth(rows, truth, "flight").rows
 
 
-def place(row: CalibrationRow) -> tuple[str, ...]:
-    return row["sensor"], row["method"], row["parameter"], row["axis"]
+def by_name(rows: list[CalibrationRow]) -> dict[str, list[CalibrationRow]]:
+    found: dict[str, list[CalibrationRow]] = {}
+    for row in rows:
+        found.setdefault(constant(row["sensor"], row["axis"], row["parameter"]), []).append(row)
+    return found
+
+
+def method_shown(line: list[str], rows: list[CalibrationRow]) -> str:
+    """Whose value it is."""
+    (own,) = [r["method"] for r in by_name(rows)[line[0]] if measure(r["value"], r["sd"], r["unit"]) == line[1]]
+    return own
 
 
 def test_only_rows_that_count_are_shown(flight: tuple[list[CalibrationRow], Truth]) -> None:
     rows, truth = flight
     shown = cells(rows, truth)
     assert len(shown) == len(SENSORS) * 2 * 3
-    assert {tuple(line[:4]) for line in shown} <= {place(row) for row in rows if row["status"] == "ok"}
-    assert {line[1] for line in shown} == {"joint"}  # a clean flight: what `auto` takes
+    assert {method_shown(line, rows) for line in shown} == {"joint"}  # a clean flight: what `auto` takes
 
 
 def test_the_error_is_that_of_the_row_in_its_sd(flight: tuple[list[CalibrationRow], Truth]) -> None:
     rows, truth = flight
-    by_place = {place(row): row for row in rows}
     for line in cells(rows, truth):
-        sensor, _, parameter, axis = line[:4]
-        row = by_place[tuple(line[:4])]
-        triad = truth["constants"][sensor]
-        true = (triad["scale"] if parameter == "scale" else triad["zero"])["xyz".index(axis)]
+        (row,) = [r for r in by_name(rows)[line[0]] if r["method"] == "joint"]
+        triad = truth["constants"][row["sensor"]]
+        true = (triad["scale"] if row["parameter"] == "scale" else triad["zero"])["xyz".index(row["axis"])]
         assert row["value"] is not None
         assert row["sd"] is not None
         assert float(line[-1]) == pytest.approx((row["value"] - true) / row["sd"], abs=0.051)
@@ -58,15 +66,18 @@ def test_of_several_that_count_the_most_exact_is_shown(flight: tuple[list[Calibr
     """A serial night publishes equation error and output error side by side."""
     rows, truth = flight
     serial: list[CalibrationRow] = [{**r, "status": "ok", "reason_code": None} for r in rows if r["method"] != "joint"]
-    methods = {line[0]: line[1] for line in cells(serial[::-1], truth)}
-    assert methods == {
-        "magnetometer": "ellipsoid_robust",
-        "accelerometer": "ellipsoid_robust",
-        "gyroscope": "output_error",
-    }
+    methods = {line[0].split()[0]: method_shown(line, serial) for line in cells(serial[::-1], truth)}
+    assert methods == {"mag": "ellipsoid_robust", "accel": "ellipsoid_robust", "gyro": "output_error"}
 
 
 def test_a_refused_constant_is_left_out(flight: tuple[list[CalibrationRow], Truth]) -> None:
     rows, truth = flight
     refused: list[CalibrationRow] = [{**r, "status": "refused"} if r["sensor"] == "gyroscope" else r for r in rows]
-    assert {line[0] for line in cells(refused, truth)} == {"magnetometer", "accelerometer"}
+    assert {line[0].split()[0] for line in cells(refused, truth)} == {"mag", "accel"}
+
+
+def test_the_fleet_flew_yesterday_and_when_it_flies_again_as_it_did(tmp_path: Path) -> None:
+    now = dt.datetime(2026, 11, 30, 1, 0, tzinfo=dt.UTC)
+    assert first_flight(tmp_path, now) == dt.datetime(2026, 11, 1, 8, 0, tzinfo=dt.UTC)
+    (tmp_path / "sim-1" / "2026-11-02").mkdir(parents=True)
+    assert first_flight(tmp_path, now) == dt.datetime(2026, 11, 2, 8, 0, tzinfo=dt.UTC)

@@ -62,7 +62,7 @@ def fit_row(sample: str, tic: float) -> dict[str, Any]:
 
 def test_held_out_comparisons_stand_beside_all() -> None:
     text = io.StringIO()
-    Console(file=text, width=160).print(fit_table([fit_row("all", 0.0781), fit_row("held_out", 0.0913)]))
+    Console(file=text, width=80).print(fit_table([fit_row("all", 0.0781), fit_row("held_out", 0.0913)]))
     assert "0.0781" in text.getvalue()
     assert "0.0913" in text.getvalue()
     assert "body rate, held out" in text.getvalue()

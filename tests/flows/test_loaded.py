@@ -75,7 +75,7 @@ def test_what_was_exported_is_found_in_the_next_log(
     assert fates == dict.fromkeys(SENSORS, ("flies", latest))
     capsys.readouterr()
     assert run(["compare", "v", "--warehouse", str(root)]) == 0
-    told = capsys.readouterr().out
+    told = " ".join(capsys.readouterr().out.split())
     assert told.count(f"loaded since flight {latest}") == len(SENSORS)
     # What flies now is what is estimated: nothing matters any more.
     assert not [row for row in fieldcal.compare(warehouse.calibration_at("v")) if row.matters]

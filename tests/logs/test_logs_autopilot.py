@@ -57,6 +57,14 @@ def test_without_an_accelerometer_nothing_is_joined() -> None:
     assert joined.outside == 3
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_single_reading_is_joined_with_what_has_its_stamp() -> None:
+    t = np.arange(3) * MS
+    joined = join_on_gyroscope(t, linear(t), t[1:2], linear(t[1:2]))
+    np.testing.assert_array_equal(joined.columns["t_ns"], t[1:2])
+    assert (joined.interpolated, joined.left_out, joined.outside) == (0, 0, 2)
+
+
 def test_only_a_pause_loses_data() -> None:
     for left_out, loses in ((0, False), (2, True)):
         summary = LogSummary("x")

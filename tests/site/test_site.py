@@ -26,7 +26,7 @@ from fieldcal.config.configuration import Alerts
 from fieldcal.exports import FORMATS, export_to
 from fieldcal.exports.calibration_at import constants_of
 from fieldcal.names import Standing
-from fieldcal.report.fitness import fleet_fitness
+from fieldcal.report.fitness import Criteria, fleet_fitness
 from fieldcal.report.links import flight_name, vehicle_name
 from fieldcal.report.trend import change_sentence
 from fieldcal.simulation.archive import write_flights
@@ -99,7 +99,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("fleet")
     kinds = {"alpha": "stable", "bravo": "step", "charlie": "drifting", "echo": "insufficient"}
     publish_fleet(root, kinds, n_flights=8)
-    write_site(root, Alerts(expires_days=1e5), now=NOW)
+    write_site(root, Criteria(Alerts(expires_days=1e5)), now=NOW)
     return root
 
 
@@ -131,7 +131,7 @@ def test_nothing_outside_is_named_and_nothing_inline_runs(fleet: Path) -> None:
 
 def test_first_page_says_who_is_fine_to_fly_and_why_not(fleet: Path) -> None:
     page = Page(fleet / "site" / "index.html")
-    fitness = fleet_fitness(Warehouse(fleet), Alerts(expires_days=1e5), NOW)
+    fitness = fleet_fitness(Warehouse(fleet), Criteria(Alerts(expires_days=1e5)), NOW)
     assert "Fleet: 1 of 4 vehicles fine to fly" in page.text
     assert {v: one.standing for v, one in fitness.items()} == {
         "alpha": Standing.FINE,
@@ -149,7 +149,7 @@ def test_first_page_says_who_is_fine_to_fly_and_why_not(fleet: Path) -> None:
 
 
 def test_a_constant_that_is_too_old_is_looked_at(fleet: Path) -> None:
-    old = fleet_fitness(Warehouse(fleet), Alerts(expires_days=100.0), NOW)["alpha"]
+    old = fleet_fitness(Warehouse(fleet), Criteria(Alerts(expires_days=100.0)), NOW)["alpha"]
     assert old.standing == Standing.LOOK
     assert old.reasons == (
         "Expired: magnetometer, accelerometer, gyroscope last calibrated on 2026-06-22; that counts for 100 days.",
@@ -261,7 +261,7 @@ def test_a_page_that_was_removed_or_cut_short_is_made_again(fleet: Path) -> None
     whole = {name: (site / name).read_bytes() for name in ("vehicle-alpha.html", "data/vehicle-bravo.js")}
     (site / "vehicle-alpha.html").unlink()
     (site / "data" / "vehicle-bravo.js").write_bytes(b"fieldcal")
-    write_site(fleet, Alerts(expires_days=1e5), now=NOW)
+    write_site(fleet, Criteria(Alerts(expires_days=1e5)), now=NOW)
     assert {name: (site / name).read_bytes() for name in whole} == whole
 
 
@@ -295,7 +295,7 @@ def test_a_night_writes_it_and_the_next_nothing(tmp_path: Path) -> None:
         for publishing in publishings(planned, outcomes):
             publishing.publish()
         planned.remember(outcomes)
-        closing = close_night(tmp_path / "data", Alerts(expires_days=1e5, idle_days=1e5))
+        closing = close_night(tmp_path / "data", Criteria(Alerts(expires_days=1e5, idle_days=1e5)))
         assert closing.site == tmp_path / "data" / "site" / "index.html"
 
     flown = Experiment(seed=3, duration_s=6.0)

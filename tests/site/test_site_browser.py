@@ -29,6 +29,7 @@ from report_rows import publish_fleet
 from fieldcal.batch.flights import one_flight
 from fieldcal.batch.night import plan_night, publishings
 from fieldcal.config.configuration import Alerts
+from fieldcal.report.fitness import Criteria
 from fieldcal.report.links import flight_name
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
@@ -72,7 +73,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     outcomes = [one_flight(root, job, night.configuration) for job in night.missing()]
     for publishing in publishings(night, outcomes):
         publishing.publish()
-    return write_site(root, Alerts(expires_days=1e5)).parent
+    return write_site(root, Criteria(Alerts(expires_days=1e5))).parent
 
 
 @pytest.fixture(scope="module")

@@ -57,7 +57,7 @@ def test_the_fleet_is_judged(root: Path) -> None:
     step = odd.row(by_predicate=pl.col("status") == "step", named=True)
     assert abs(step["change_at"] - START - dt.timedelta(days=7 * 15)) <= dt.timedelta(days=7)
     assert step["change_size"] == pytest.approx(STEP, rel=0.15)
-    assert step["reason"].startswith("Stepped by 0.0")
+    assert step["reason"].startswith("Stepped by 0.5")
     slopes = table.filter(sensor="gyroscope")
     error = (slopes["slope_per_degc"] - PER_DEGC) / slopes["slope_per_degc_sd"]
     assert error.abs().max() < 4.0  # type: ignore[operator]
@@ -102,7 +102,7 @@ def test_one_session_is_insufficient_and_says_so(tmp_path: Path, capsys: pytest.
     assert run(["drift", "--json", "--warehouse", str(tmp_path)]) == 0
     document = json.loads(capsys.readouterr().out)
     assert {row["status"] for row in document} == {"insufficient"}
-    assert {row["reason"] for row in document} == {"1 session: a trend needs 5."}
+    assert {row["reason"] for row in document} == {"1 session: a trend needs 5, 4 more."}
     assert {row["slope_per_degc"] for row in document} == {None}
 
 
@@ -281,7 +281,7 @@ def test_a_new_unit_borrows_from_the_fleet_and_says_so(tmp_path: Path) -> None:
     row = averaged.filter(source="drift").row(0, named=True)
     assert row["why"].startswith("Mean of 3 sessions, weighted by the scatter of 12 siblings")
     assert row["sd"] < TAU
-    assert told.filter(imu_id="imu-12")["reason"][0].startswith("3 sessions: a trend needs 5. The value is")
+    assert told.filter(imu_id="imu-12")["reason"][0].startswith("3 sessions: a trend needs 5, 2 more. The value is")
     assert (stepped["source"] == "flight").all()
     last = young["v13"].filter(flight_id="v13-002").sort("sensor", "axis")
     assert stepped.sort("sensor", "axis")["value_at_25degc"].to_list() == last["value"].to_list()

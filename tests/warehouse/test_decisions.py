@@ -14,6 +14,7 @@ from fieldcal.batch.closing import close_night
 from fieldcal.config.configuration import Alerts
 from fieldcal.errors import FieldcalError
 from fieldcal.names import Decision
+from fieldcal.report.fitness import Criteria
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.content import content_sha256
 from fieldcal.warehouse.decisions import decide as decisions
@@ -153,7 +154,7 @@ def test_where_deciding_was_interrupted_the_next_night_ends_it(root: Path) -> No
     )
     append(root, "a", "decision", decided)
     assert statuses(root, FLIGHTS[4]) == {"ok"}
-    close_night(root, Alerts())
+    close_night(root, Criteria(Alerts()))
     assert statuses(root, FLIGHTS[4]) == {"withdrawn"}
     assert settle(root, "a") == ()
 

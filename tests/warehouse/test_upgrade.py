@@ -25,6 +25,7 @@ from fieldcal.batch.night import plan_night, publishings
 from fieldcal.batch.outcome import Outcome
 from fieldcal.cli.main import run
 from fieldcal.provenance.run_key import code_digest
+from fieldcal.report.fitness import Criteria
 from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES, migrations
 from fieldcal.schemas.arrow import VERSION_KEY
 from fieldcal.schemas.migrations import CHANGES, Change, fillings
@@ -123,7 +124,7 @@ def test_a_night_on_top_keeps_what_was_there(upgraded: bool, tmp_path: Path) -> 
     answer = flights(str(root), night.source, [job.plain() for job in night.missing()], code_digest())
     for publishing in publishings(night, [Outcome.of(plain) for plain in answer["outcomes"]]):
         publishing.publish()
-    close_night(root, night.configuration.alerts)
+    close_night(root, Criteria.of(night.configuration))
     assert verify(root)["ok"]
     flown = Warehouse(root).scan("flight").collect()
     assert flown.height == 3

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import polars as pl
@@ -18,6 +18,8 @@ from fieldcal.warehouse import checksums
 from fieldcal.warehouse.errors import disk
 from fieldcal.warehouse.layout import checksum_path, encode_id, history_path, signal_files
 from fieldcal.warehouse.query import Warehouse
+from fieldcal.warehouse.remote.share import share
+from fieldcal.warehouse.remote.turn import in_turn
 from fieldcal.warehouse.signals import signal_ids
 
 
@@ -32,11 +34,14 @@ class Removable:
     lost : str
         What is lost, and how it would come back.
     files : tuple of Path
+    vehicle_id : str, optional
+        Whose history is among them.
     """
 
     what: str
     lost: str
     files: tuple[Path, ...]
+    vehicle_id: str | None = None
 
     @cached_property
     def size_bytes(self) -> int:
@@ -94,6 +99,7 @@ def of_vehicle(root: Path, vehicle_id: str) -> Removable:
         f"all of vehicle {vehicle_id}: {len(flights)} flights",
         "its history, decisions and exports for good; its flights come back if a night finds their logs",
         (*tables, *signals, *stages),
+        vehicle_id,
     )
 
 
@@ -102,6 +108,14 @@ def remove(root: Path, one: Removable) -> None:
 
     Interrupted, it leaves whole files only, and a warehouse that `verify` calls whole.
     """
+    if one.vehicle_id is None:
+        _remove(root, one)
+    else:
+        in_turn(root, one.vehicle_id, partial(_remove, root, one))
+        share(root)
+
+
+def _remove(root: Path, one: Removable) -> None:
     for path in one.files:
         beside = checksum_path(root, path)
         if beside.exists() and (allowed := checksums.recorded(root, path)):

@@ -27,8 +27,9 @@ from fieldcal.warehouse.layout import (
     under,
     vehicle_of,
 )
-from fieldcal.warehouse.lock import vehicle_lock
 from fieldcal.warehouse.questions import existing
+from fieldcal.warehouse.remote.share import share
+from fieldcal.warehouse.remote.turn import in_turn
 from fieldcal.warehouse.store import read_older, table_bytes
 
 
@@ -85,6 +86,7 @@ def upgrade(root: Path, *, dry_run: bool = False, timeout_s: float = 300.0) -> U
     found = [_upgraded(root, table, path, dry_run, timeout_s) for table, path in files]
     if not dry_run:
         _remove_former_records(root)
+        share(root)
     told = [outcome for outcome in found if outcome is not None]
     return {"ok": all(outcome["status"] != "left" for outcome in told), "files": len(files), "upgraded": told}
 
@@ -128,17 +130,21 @@ def _upgraded(root: Path, table: str, path: Path, dry_run: bool, timeout_s: floa
         outcome["vehicle_id"] = vehicle_id = ids[0] if ids else outcome["vehicle_id"]
         outcome["from_version"], outcome["rows"] = version, rows.num_rows
         if not dry_run:
-            with vehicle_lock(root, vehicle_id, timeout_s):
-                version, rows = _read(root, table, path)  # a night may have published meanwhile
-                if version != known:
-                    write_bytes(path, table_bytes(rows, table), partial(checksums.recording, root, path))
-                if moves:
-                    _rename(root, path, place)
+            in_turn(root, vehicle_id, partial(_bring, root, table, path, place), timeout_s=timeout_s)
     except WarehouseError as error:
         if error.reason_code not in (ReasonCode.DAMAGED_FILE, ReasonCode.SCHEMA_MISMATCH):
             raise
         outcome["status"], outcome["reason"] = "left", error.sentence
     return outcome
+
+
+def _bring(root: Path, table: str, path: Path, place: Path) -> None:
+    """Write a file as today's version, in today's place."""
+    version, rows = _read(root, table, path)  # a night may have published meanwhile
+    if version != TABLES[table].version:
+        write_bytes(path, table_bytes(rows, table), partial(checksums.recording, root, path))
+    if path != place:
+        _rename(root, path, place)
 
 
 def _read(root: Path, table: str, path: Path) -> tuple[int, pa.Table]:

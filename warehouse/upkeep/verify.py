@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, TypedDict, cast
 
 from fieldcal.errors import FieldcalError
-from fieldcal.reason_codes import ReasonCode
 from fieldcal.warehouse import checksums
 from fieldcal.warehouse.content import content_sha256
-from fieldcal.warehouse.errors import WarehouseError, disk
+from fieldcal.warehouse.errors import WarehouseError, disk, no_warehouse
 from fieldcal.warehouse.files import TEMPORARY, file_sha256
 from fieldcal.warehouse.layout import FORMER_PARTITION, PARTITION, SITE, history_files, under
+from fieldcal.warehouse.remote.whole import remote_files
 from fieldcal.warehouse.sealed import BrokenSeal, unseal
 from fieldcal.warehouse.stage_store import RECORD, broken_outputs, outputs_of
 from fieldcal.warehouse.store import read_table
@@ -65,10 +65,9 @@ def verify(root: Path, archive: Path | None = None, log_sha256: Callable[[Path],
         `no_warehouse`: there is nothing at `root`.
     """
     if not root.is_dir():
-        raise WarehouseError(
-            ReasonCode.NO_WAREHOUSE, f"There is no warehouse at {root}; run `fieldcal nightly` or give --warehouse."
-        )
+        raise no_warehouse(root)
     found = [*_recorded_files(root), *_stage_files(root), *night_files(root), *_site_files(root)]
+    found += remote_files(root)
     if archive is not None:
         if log_sha256 is None:
             raise ValueError("log_sha256 is needed to check an archive")

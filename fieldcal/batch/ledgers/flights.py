@@ -11,16 +11,17 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypedDict, cast
 
 from fieldcal.batch.documents import LogEntry
+from fieldcal.batch.ledgers.shared import Shared
 from fieldcal.batch.limits import why_ended
 from fieldcal.batch.outcome import Outcome
 from fieldcal.batch.sources import sources
 from fieldcal.config.configuration import Configuration
-from fieldcal.flight.job import Job
+from fieldcal.flight.job import Job, PlainJob
 from fieldcal.flight.record import Record
 from fieldcal.flight.versions import versions
 from fieldcal.provenance.run_key import library_versions
@@ -45,8 +46,8 @@ class Seen(TypedDict):
 class Ledger:
     """What is remembered, asked about one flight after the other."""
 
-    def __init__(self, root: Path, configuration: Configuration) -> None:
-        self._root, self._configuration = root, configuration
+    def __init__(self, root: Path, configuration: Configuration, shared: Shared | None = None) -> None:
+        self._root, self._configuration, self._shared = root, configuration, shared
         self._flights: Mapping[str, Seen] = {}
         self._histories: Mapping[str, str] = {}
         try:
@@ -62,11 +63,15 @@ class Ledger:
     def entry(self, job: Job) -> LogEntry | None:
         """What to say of a flight of which everything is as it was; None of any other."""
         known = self._flights.get(job.flight_id)
-        if known is None or not self._history_is_same(job.vehicle_id):
-            return None
-        if known["of"] != self._of(job):
-            return None
-        return known["entry"] if _stamps(self._root, known["files"]) == known["as_they_were"] else None
+        if known is not None and self._is_as_it_was(job, known):
+            return known["entry"]
+        return None if self._shared is None else self._shared.entry(job, self._of_content(job))
+
+    def whole(self, outcomes: Iterable[Outcome]) -> Iterator[tuple[Job, str, LogEntry]]:
+        """Of flights all of whose results were kept: what they follow from, and what to say of them."""
+        for outcome in outcomes:
+            if (seen := self._seen(outcome)) is not None:
+                yield outcome.job, self._of_content(outcome.job), seen["entry"]
 
     def remember(self, outcomes: Iterable[Outcome], done: Mapping[str, LogEntry]) -> None:
         """Remember a night's flights: the outcomes, all of whose results were kept, and those that were `done`."""
@@ -92,13 +97,24 @@ class Ledger:
             return None
         files = sorted(_files(self._root, job, records))
         entry: LogEntry = {**outcome.entry(), "stages_run": 0, "stages_cached": len(records), "ran": {}}
-        return {"of": self._of(job), "files": files, "as_they_were": _stamps(self._root, files), "entry": entry}
+        of = self._of(job.plain())
+        return {"of": of, "files": files, "as_they_were": _stamps(self._root, files), "entry": entry}
 
-    def _of(self, job: Job) -> str:
+    def _of(self, job: PlainJob) -> str:
         """Digest of what a flight's results, and what is said of it, follow from."""
-        if (vehicle := self._vehicles.get(job.vehicle_id)) is None:
-            vehicle = self._vehicles[job.vehicle_id] = self._configuration.vehicle(job.vehicle_id).model_dump_json()
-        return _digest([job.plain(), vehicle, self._common])
+        vehicle_id = job["vehicle_id"]
+        if (vehicle := self._vehicles.get(vehicle_id)) is None:
+            vehicle = self._vehicles[vehicle_id] = self._configuration.vehicle(vehicle_id).model_dump_json()
+        return _digest([job, vehicle, self._common])
+
+    def _is_as_it_was(self, job: Job, known: Seen) -> bool:
+        if known["of"] != self._of(job.plain()):
+            return False
+        return self._history_is_same(job.vehicle_id) and _stamps(self._root, known["files"]) == known["as_they_were"]
+
+    def _of_content(self, job: Job) -> str:
+        """What its results follow from wherever its log lies."""
+        return self._of({**job.plain(), "path": "", "stamp": []})
 
     def _history_is_same(self, vehicle_id: str) -> bool:
         if vehicle_id not in self._same_history:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fieldcal.batch.documents import LogEntry, NightDocument
 from fieldcal.names import Verdict
-from fieldcal.trends.changes import KINDS
+from fieldcal.report.standing.reason import KINDS
 from fieldcal.words.printable import printable
 
 MOST_OF_VEHICLE, MOST_VEHICLES, MOST_LOGS = 4, 15, 15
@@ -49,7 +49,8 @@ def news_of(night: NightDocument, archive: Path, link: str | None = None) -> Mes
     lines = [*_vehicles(by_vehicle), *_logs(logs)]
     if good:
         lines += ["", "Fine again:", *_some([change["sentence"] for change in good], MOST_LOGS, "fieldcal drift")]
-    report = f"{link.rstrip('/')}/{Path(night['report']).name}" if link else night["report"]
+    path = Path(night["report"])
+    report = f"{link.rstrip('/')}/{path.name}" if link else path.absolute()
     lines += ["", f"Report: {report}"]
     return Message(_title(archive, by_vehicle, logs), _printed(lines))
 
@@ -73,7 +74,8 @@ def _title(archive: Path, by_vehicle: dict[str, list[str]], logs: Sequence[LogEn
         need = "needs" if len(names) == 1 else "need"
         return printable(f"fieldcal, {archive.name}: {some} {need} a look")
     if logs:
-        return printable(f"fieldcal, {archive.name}: {len(logs)} new logs are not fine")
+        what = "1 new log is" if len(logs) == 1 else f"{len(logs)} new logs are"
+        return printable(f"fieldcal, {archive.name}: {what} not fine")
     return printable(f"fieldcal, {archive.name}: fine again")
 
 

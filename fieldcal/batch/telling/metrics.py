@@ -9,7 +9,7 @@ import polars as pl
 
 from fieldcal.batch.documents import NightDocument
 from fieldcal.names import Verdict
-from fieldcal.trends.changes import last_usable
+from fieldcal.report.history import last_usable
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.files import write_bytes
 
@@ -31,7 +31,9 @@ def write_metrics(path: Path, night: NightDocument, root: Path, *, ended_at_s: f
     """
     counts: Mapping[str, object] = night
     drift = Warehouse(root).scan("drift").group_by("status").len().sort("status").collect()
-    latest = last_usable(root).filter(pl.col("last_at").is_not_null()).sort("vehicle_id", "unit_id", "sensor")
+    latest = (
+        last_usable(Warehouse(root)).filter(pl.col("last_at").is_not_null()).sort("vehicle_id", "unit_id", "sensor")
+    )
     lines = [
         *_family("fieldcal_night_end_timestamp_seconds", "When the last night ended.", [({}, ended_at_s)]),
         *_family("fieldcal_night_duration_seconds", "How long the last night took.", [({}, seconds)]),

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
+from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+from fieldcal.cli.present.constants import constant
 from fieldcal.cli.present.night import print_night
 from fieldcal.cli.present.progress import NightProgress
-from fieldcal.cli.show import console, table
+from fieldcal.cli.present.screen import Listing, console, table
 from fieldcal.flows.run import run_night
 from fieldcal.names import SENSORS, Status, exactness
+from fieldcal.schemas.reference import ENOUGH_SESSIONS
 from fieldcal.schemas.rows import CalibrationRow
-from fieldcal.simulation.archive import Truth, write_flights
+from fieldcal.simulation.archive import DAYS_BETWEEN, FIRST_FLIGHT, Truth, write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.stages.tables import AXES
 from fieldcal.warehouse import Warehouse
-from fieldcal.words.numbers import number, with_sd
+from fieldcal.words.measures import measure
 from fieldcal.words.rows import typed
 from fieldcal.words.talk import say
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-VEHICLES, SESSIONS, FLIGHTS = 2, 2, 1
+VEHICLES, SESSIONS, FLIGHTS = 2, ENOUGH_SESSIONS, 1
+WORKERS = min(2, os.cpu_count() or 1)
 PARAMETERS: tuple[Literal["scale", "zero"], ...] = ("scale", "zero")
 QUESTIONS = (
     "SELECT vehicle_id, sensor, axis, value_at_25degc, sd FROM latest_calibration WHERE parameter = 'scale'",
@@ -37,10 +39,11 @@ def run_demo(folder: Path, root: Path, config: Path | None) -> bool:
     """Simulate, run the night, print. Whether any log is not `ok`."""
     archive = folder / "archive"
     say(f"Simulating {VEHICLES} vehicles, {SESSIONS} sessions each, in {archive} …")
-    logs = write_flights(archive, Experiment(), vehicles=VEHICLES, sessions=SESSIONS, flights=FLIGHTS)
+    first = first_flight(archive, datetime.now(UTC))
+    logs = write_flights(archive, Experiment(), vehicles=VEHICLES, sessions=SESSIONS, flights=FLIGHTS, first=first)
     say("Running the night (its first minute goes to Prefect's server) …")
     with NightProgress() as progress:
-        result = run_night(archive.absolute(), root, config, None, 1, progress)
+        result = run_night(archive.absolute(), root, config, None, WORKERS, progress)
     out = console()
     print_night(out, result, root)
     uri = logs[0].relative_to(archive).as_posix()
@@ -49,13 +52,22 @@ def run_demo(folder: Path, root: Path, config: Path | None) -> bool:
     stored = Warehouse(root).scan("calibration", flight_id=flight).collect()
     out.print(beside_truth(list(typed(stored.iter_rows(named=True), CalibrationRow)), truth, uri))
     out.print("Ask next:", markup=False)
+    out.print(f"  fieldcal drift --warehouse {root} --vehicle sim-1", markup=False, soft_wrap=True)
     for question in QUESTIONS:
         out.print(f'  fieldcal sql --warehouse {root} "{question}"', markup=False, soft_wrap=True)
     return bool(result["ok"] != len(result["logs"]))
 
 
-def beside_truth(rows: Sequence[CalibrationRow], truth: Truth, uri: str) -> Table:
-    """Scale and zero of one flight, by the method that counts, with sd, the truth, and the error in sd and per cent."""
+def first_flight(archive: Path, now: datetime) -> datetime:
+    """When the fleet flies first: so that its last session was yesterday; where it flew already, as it did."""
+    flown = sorted(archive.glob("*/????-??-??"))
+    yesterday = now.date() - timedelta(days=1 + DAYS_BETWEEN * (SESSIONS - 1))
+    day = date.fromisoformat(flown[0].name) if flown else yesterday
+    return datetime.combine(day, FIRST_FLIGHT.timetz())
+
+
+def beside_truth(rows: Sequence[CalibrationRow], truth: Truth, uri: str) -> Listing:
+    """Scale and zero of one flight, by the method that counts, with sd, the truth, and the error in sd."""
     counting = sorted((row for row in rows if row["status"] == Status.OK), key=lambda row: -exactness(row["method"]))
     found = {(row["sensor"], row["parameter"], row["axis"]): row for row in counting}
     lines = []
@@ -65,14 +77,13 @@ def beside_truth(rows: Sequence[CalibrationRow], truth: Truth, uri: str) -> Tabl
                 row = found.get((sensor, parameter, axis))
                 true = truth["constants"][sensor][parameter][i]
                 if row is not None and row["value"] is not None:
-                    value, sd = row["value"], row["sd"]
-                    found_and_true = (with_sd(value, sd), number(true, 6), *_error(value, sd, true))
-                    lines.append([sensor, row["method"], parameter, axis, *found_and_true])
-    columns = ["sensor", "method", "parameter", "axis", "found", "truth", "error %", "error in sd"]
+                    value, sd, unit = row["value"], row["sd"], row["unit"]
+                    name = constant(sensor, axis, parameter)
+                    found_and_true = measure(value, sd, unit), measure(true, None, unit), _error(value, sd, true)
+                    lines.append([name, *found_and_true])
+    columns = ["constant", "found", "truth", "off by, sd"]
     return table(columns, lines, f"{uri} beside the truth of the simulation")
 
 
-def _error(value: float, sd: float | None, true: float) -> tuple[str, str]:
-    error = value - true
-    in_sd = f"{error / sd:+.1f}" if sd else "–"
-    return f"{100 * error / abs(true):+.2f}", in_sd
+def _error(value: float, sd: float | None, true: float) -> str:
+    return f"{(value - true) / sd:+.1f}" if sd else "–"

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 
-from rich.console import Console
-
 from fieldcal.batch.documents import LogEntry, NightDocument, PlanDocument, PlannedLog, UnreadEntry
-from fieldcal.batch.outcome import cause, verdict_counts
-from fieldcal.cli.show import table
+from fieldcal.batch.outcome import cause
+from fieldcal.cli.present.flight import agreement, tic_and_rms
+from fieldcal.cli.present.screen import Screen, table
 from fieldcal.logs.unread import Unread, told
 from fieldcal.names import Standing, Verdict
-from fieldcal.report.fitness import fleet_fitness, ranked, remembered_alerts
+from fieldcal.report.fitness import ranked
+from fieldcal.report.standing.memory import remembered_fleet
+from fieldcal.report.words import count
 from fieldcal.warehouse import Warehouse
 from fieldcal.words.flights import is_consequence
-from fieldcal.words.numbers import number
 
 WORST = 5
 REFUSALS = 12
@@ -24,13 +24,17 @@ CHANGES = 20
 VEHICLES = 15
 
 
-def print_night(console: Console, result: NightDocument, root: Path) -> None:
-    """The closing table: verdicts, what was refused and why, the worst fits, where to look next."""
-    counts = verdict_counts(result)
+def print_night(console: Screen, result: NightDocument, root: Path) -> None:
+    """The answer first: who is fine to fly, what changed; then logs that need a look, and what was refused and why."""
     work = f"{result['stages_run']} stages run, {result['stages_cached']} from the cache, {result['seconds']:.1f} s"
-    console.print(f"{len(result['logs'])} logs: {counts}; {work}", markup=False)
+    console.print(f"{count(len(result['logs']), 'log')}: {_verdicts(result)}; {work}")
     print_unread(console, result["unread"])
     print_fleet(console, root)
+    if result["changes"]:
+        lines = [[change["kind"].replace("_", " "), change["sentence"]] for change in result["changes"]]
+        console.print(table(["new", "what"], lines[:CHANGES], "What changed in the fleet"))
+        if len(lines) > CHANGES:
+            console.print(f"… and {len(lines) - CHANGES} more: fieldcal drift")
     troubled = [log for log in result["logs"] if log["verdict"] != Verdict.OK or log["reason_code"]]
     if troubled:
         lines = [[log["log_uri"], log["verdict"], log["reason"] or ""] for log in troubled]
@@ -39,36 +43,39 @@ def print_night(console: Console, result: NightDocument, root: Path) -> None:
     if refused:
         console.print(table(["log", "refused", "why"], refused[:REFUSALS], "Refusals"))
         if len(refused) > REFUSALS:
-            console.print(f"  … and {len(refused) - REFUSALS} more: SELECT * FROM refusals", markup=False)
-    worst = _worst(root, [log["flight_id"] for log in result["logs"]])
+            console.print(f"… and {len(refused) - REFUSALS} more: SELECT * FROM refusals")
+    worst = _worst(root, [log["flight_id"] for log in result["logs"]]) if console.is_wide else []
     if worst:
-        columns = ["log", "quantity", "method", "against", "TIC", "rms"]
+        columns = ["log", "agreement", "TIC", "rms"]
         console.print(table(columns, worst, "Poorest agreement (Theil inequality coefficient, smoothed)"))
-    if result["changes"]:
-        lines = [[change["kind"], change["sentence"]] for change in result["changes"]]
-        console.print(table(["new", "what"], lines[:CHANGES], "What changed in the fleet"))
-        if len(lines) > CHANGES:
-            console.print(f"  … and {len(lines) - CHANGES} more: fieldcal drift", markup=False)
-    console.print(f"History: {root}/tables (fieldcal history, drift, sql)", markup=False)
-    console.print(f"Report:  {result['report']} (fieldcal report --vehicle V, --flight ID)", markup=False)
-    console.print(
-        f"Site:    {result['site']} (every vehicle and flight; any web server serves its folder)", markup=False
-    )
+    console.print()
+    console.print(f"Report: {result['report']}")
+    if result["site"]:
+        console.print(f"Site:   {result['site']}")
+    console.print("Ask:    fieldcal drift, history, sql, report --vehicle V, --flight ID")
 
 
-def print_fleet(console: Console, root: Path) -> None:
-    """Which vehicles are fine to fly, and of the others why not, the gravest first: as the site says it."""
-    fleet = fleet_fitness(Warehouse(root), remembered_alerts(root), datetime.now(UTC))
+def _verdicts(result: NightDocument) -> str:
+    counts = Counter(log["verdict"] for log in result["logs"])
+    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in Verdict if counts[verdict]) or "none"
+
+
+def print_fleet(console: Screen, root: Path) -> None:
+    """Which vehicles are fine to fly, and of the others why not, the gravest first: what the night said of them."""
+    fleet = remembered_fleet(root)
     if not fleet:
         return
     fine = sum(one.standing == Standing.FINE for one in fleet.values())
-    console.print(f"Fleet: {fine} of {len(fleet)} vehicles fine to fly", markup=False)
+    console.print(f"Fleet: {fine} of {len(fleet)} vehicles fine to fly")
     others = [one for one in ranked(fleet) if one.standing != Standing.FINE]
     if others:
         lines = [[one.vehicle_id, one.standing, one.why(1)] for one in others[:VEHICLES]]
         console.print(table(["vehicle", "standing", "why"], lines))
         if len(others) > VEHICLES:
-            console.print(f"  … and {len(others) - VEHICLES} more: the site's first page", markup=False)
+            console.print(f"… and {len(others) - VEHICLES} more: the site's first page")
+    following = [[one.vehicle_id, one.next] for one in ranked(fleet) if one.next and one.next not in one.why(1)]
+    if following:
+        console.print(table(["vehicle", "next calibration"], following[:VEHICLES]))
 
 
 def _refusals(log: LogEntry) -> list[list[str]]:
@@ -81,21 +88,19 @@ def _refusals(log: LogEntry) -> list[list[str]]:
     return [[name, ", ".join(own), reason] for name, (reason, own) in zip(names, stages.items(), strict=False)]
 
 
-def print_plan(console: Console, plan: PlanDocument) -> None:
+def print_plan(console: Screen, plan: PlanDocument) -> None:
     """What a night would do."""
-    console.print(
-        f"{len(plan['logs'])} logs; {plan['stages_to_run']} stages would run. Nothing was changed.", markup=False
-    )
+    console.print(f"{len(plan['logs'])} logs; {plan['stages_to_run']} stages would run. Nothing was changed.")
     print_unread(console, plan["unread"])
     lines = [[log["log_uri"], _would(log)] for log in plan["logs"] if log["would_run"] or log["copy_of"]]
     if lines:
         console.print(table(["log", "would run"], lines))
 
 
-def print_unread(console: Console, unread: Sequence[UnreadEntry]) -> None:
+def print_unread(console: Screen, unread: Sequence[UnreadEntry]) -> None:
     """A line on what lies beside the logs, where there is something."""
     if unread:
-        console.print(told([Unread(**entry) for entry in unread]), markup=False)
+        console.print(told([Unread(**entry) for entry in unread]))
 
 
 def _would(log: PlannedLog) -> str:
@@ -118,4 +123,7 @@ def _worst(root: Path, flights: Sequence[str]) -> list[list[str]]:
         .head(WORST)
         .collect()
     )
-    return [[*row[:4], number(row[4], 3), f"{number(row[5], 3)} {row[6]}"] for row in rows.iter_rows()]
+    return [
+        [row["log_uri"], agreement(row), *tic_and_rms(row["tic"], row["rms"], row["rms_unit"])]
+        for row in rows.iter_rows(named=True)
+    ]
