@@ -14,9 +14,9 @@ from obstore.store import from_url
 from fieldcal.batch.closing import close_night
 from fieldcal.batch.flights import one_flight
 from fieldcal.batch.night import Night, plan_night, publishings
-from fieldcal.config.configuration import load
 from fieldcal.remote.objects import Objects
 from fieldcal.remote.places import archive_at, session_at
+from fieldcal.report.fitness import Criteria
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse.content import content_sha256
@@ -83,7 +83,7 @@ def finish(planned: Night) -> None:
     for publishing in publishings(planned, outcomes):
         publishing.publish()
     planned.remember(outcomes)
-    close_night(planned.root, load(None).alerts)
+    close_night(planned.root, Criteria())
 
 
 def is_whole(url: str, content: str) -> None:
