@@ -3,6 +3,7 @@ half a minute of motion would tell most beside it."""
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Literal
 
 import fieldcal
@@ -33,6 +34,7 @@ def pooled(
     vehicle: str | None = None,
     sensor: Literal["magnetometer", "accelerometer", "gyroscope"] | None = None,
     parameter: str | None = None,
+    at: datetime | None = None,
     flights: bool = False,
     wide: Wide = False,
     as_json: AsJson = False,
@@ -50,6 +52,8 @@ def pooled(
         Only this sensor.
     parameter
         scale, zero, cross, lever_arm, delay, ...
+    at
+        What they were at another moment, by all flights before and after it: 2026-02-01, or with a time, UTC.
     flights
         Instead how much each flight contributed: the share of what was known then that would not have been without it;
         none where it contradicts the others and was left out.
@@ -61,7 +65,7 @@ def pooled(
     from fieldcal.cli.present.screen import console
     from fieldcal.cli.show import print_frame
 
-    rows = fieldcal.Warehouse(warehouse).pooled(vehicle=vehicle, sensor=sensor, parameter=parameter)
+    rows = fieldcal.Warehouse(warehouse).pooled(vehicle=vehicle, sensor=sensor, parameter=parameter, at=at)
     if flights:
         place = ["vehicle_id", "unit_id", "sensor", "parameter", "axis"]
         each = rows.select(*place, "flights", "shares", "left_out").explode("flights", "shares")

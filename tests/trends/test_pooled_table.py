@@ -180,7 +180,7 @@ def test_each_flight_s_share_is_told(fleet: tuple[Path, list[Truth]], capsys: py
     assert not any(r["left_out"] for r in rows)
 
 
-def test_any_moment_can_be_asked_for(fleet: tuple[Path, list[Truth]]) -> None:
+def test_any_moment_can_be_asked_for(fleet: tuple[Path, list[Truth]], capsys: pytest.CaptureFixture[str]) -> None:
     """At the last session it is the table; at every session the truth of then, by its sd; between two, less is known;
     before the first, less and less."""
     root, truths = fleet
@@ -203,6 +203,11 @@ def test_any_moment_can_be_asked_for(fleet: tuple[Path, list[Truth]]) -> None:
     assert warehouse.pooled(vehicle="v0", at=now["started_at"][0])["value_at_25degc"].to_list() == pytest.approx(
         now["value_at_25degc"].to_list()
     )
+    moment = f"{start + dt.timedelta(days=float(day[2])):%Y-%m-%dT%H:%M:%S}"
+    capsys.readouterr()
+    assert run(["pooled", "--vehicle", "v0", "--at", moment, "--json", "--warehouse", str(root)]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [row["sd"] for row in told] == pytest.approx(sd[2], rel=1e-3)
     assert np.abs(z).max() < 4.5
     assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.5
     assert (sd[-2] >= np.minimum(sd[3], sd[4])).all()
