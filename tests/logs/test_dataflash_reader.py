@@ -276,7 +276,7 @@ def test_faster_gyr_and_acc_are_taken_instead_of_imu(
     assert [f.count for f in summary.findings if f.code == "interpolated"] == [int(inside.sum())]
 
 
-@pytest.mark.parametrize(("options", "filtered"), [(0, False), (4, True), (8, False)])
+@pytest.mark.parametrize(("options", "filtered"), [(0, False), (4, True), (8, False), (12, False), (20, True)])
 def test_the_log_option_says_whether_gyr_is_filtered(
     tmp_path: Path, fast: list[write.Messages], options: int, filtered: bool
 ) -> None:

@@ -212,6 +212,7 @@ def test_short_long_damaged_and_wordy_rows_are_counted_with_their_line(tmp_path:
         ("incomplete_row", 31),
     ):
         assert f"line {line}." in told[code][1]
+        assert (" is none: " in told[code][1]) == (code == "bad_time")
     assert all(finding.loses_data for finding in summary.findings)
 
 

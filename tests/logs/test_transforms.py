@@ -11,6 +11,7 @@ from logs_support import vehicle
 
 from fieldcal.config.configuration import McapMap
 from fieldcal.logs import read_log
+from fieldcal.logs.encodings import transforms
 
 N = 60
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
@@ -59,6 +60,22 @@ def test_poses_of_the_configured_frame_are_the_vps(tmp_path: Path, ros1: bool, m
     np.testing.assert_array_equal(vps.select("qx", "qy", "qz", "qw").to_numpy(), tree.quaternion)
     np.testing.assert_array_equal(vps.select("px_m", "py_m", "pz_m").to_numpy(), tree.position)
     assert summary.findings == []
+
+
+def test_of_a_configured_frame_every_message_is_read_of_none_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(transforms, "LOOKED_AT", 7)
+    tree = Tree(ros1=False)
+    tree.add(["map"])
+    frames, _ = read_log(tree.write(tmp_path), vehicle(mcap=McapMap(vps_frame="quad")))
+    assert len(frames["vps"]) == N
+    message = tree.truth.messages.transforms([(5, "map", "quad", (1.0, 2.0, 3.0), IDENTITY)])
+    payload = np.frombuffer(tree.truth.messages.payload(message, TRANSFORMS), np.uint8)
+    starts, sizes = np.arange(20) * len(payload), np.full(20, len(payload))
+    nobody = transforms.TransformDecoder(None, None)
+    nobody.decode(np.tile(payload, 20), starts, sizes)
+    assert nobody.seen.total() == 7
 
 
 def test_a_frame_in_two_parents_is_read_in_one_of_them(tmp_path: Path) -> None:
