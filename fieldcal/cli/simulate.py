@@ -30,6 +30,7 @@ def simulate(
     sessions: Whole = 1,
     flights: Whole = 1,
     first: str | None = None,
+    workers: Whole = 1,
     duration: float | None = None,
     translation_rms: float = 0.0,
     lever_arm: str = "0,0,0",
@@ -69,6 +70,8 @@ def simulate(
         How many vehicles, sessions of each, flights in each.
     first
         When the first flight starts, 2026-05-04 or 2026-05-04T12:00 (UTC); else 2026-01-12T08:00.
+    workers
+        Processes that fly; logs do not depend on it.
     duration
         Seconds; of the manoeuvre 40, of an ordinary flight 120.
     translation_rms
@@ -128,6 +131,7 @@ def simulate(
         ("--vehicles", vehicles, 1),
         ("--sessions", sessions, 1),
         ("--flights", flights, 1),
+        ("--workers", workers, 1),
     ):
         if value < lowest:
             raise _wrong(f"{name} must be {lowest:g} or more.")
@@ -142,7 +146,14 @@ def simulate(
 
     dated = {} if first is None else {"first": moment_of("--first", first)}
     logs = fieldcal.write_flights(
-        folder, experiment, vehicles=vehicles, sessions=sessions, flights=flights, log_format=log_format, **dated
+        folder,
+        experiment,
+        vehicles=vehicles,
+        sessions=sessions,
+        flights=flights,
+        log_format=log_format,
+        workers=workers,
+        **dated,
     )
     if as_json:
         print_json({"folder": str(folder), "logs": [str(log) for log in logs]})

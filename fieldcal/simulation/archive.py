@@ -4,8 +4,10 @@ each log."""
 from __future__ import annotations
 
 import json
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TypedDict
 
@@ -39,6 +41,7 @@ def write_flights(
     flights: int = 1,
     log_format: str = "mcap",
     first: datetime = FIRST_FLIGHT,
+    workers: int = 1,
 ) -> list[Path]:
     """Write an archive of simulated flights and return the logs, sorted.
 
@@ -59,6 +62,9 @@ def write_flights(
         One MCAP file, a folder with imu.csv and vps.csv, or one ULog file with PX4's raw topics.
     first : datetime
         When the first flight starts, with a time zone; default: 2026-01-12, 08:00 UTC.
+    workers : int
+        Processes that fly; logs do not depend on it. More than one needs a script that may be imported
+        (`if __name__ == "__main__"`).
 
     Raises
     ------
@@ -84,7 +90,7 @@ def write_flights(
     if configuration.exists() and configuration.read_text(encoding="utf-8") != text:
         told = f"{configuration} is another configuration than these flights need, and stays: give another folder."
         raise FieldcalError(ReasonCode.WRONG_OPTION, told)
-    logs = []
+    planned = []
     for v, (vehicle_id, own) in enumerate(flown.items()):
         for k in range(sessions):
             day = first + timedelta(days=DAYS_BETWEEN * k)
@@ -93,12 +99,22 @@ def write_flights(
             for i in range(flights):
                 seed = int(np.random.SeedSequence([base.seed, v, k, i]).generate_state(1)[0])
                 seed = base.seed if v == k == i == 0 else seed
-                recording = simulate(replace(own, seed=seed))
                 start = day + timedelta(minutes=20 * i)
-                logs.append(write_flight(session, f"flight-{i + 1:02d}", recording, start, log_format=log_format))
+                planned.append((session, f"flight-{i + 1:02d}", replace(own, seed=seed), start, log_format))
+    if workers > 1 and len(planned) > 1:
+        with ProcessPoolExecutor(min(workers, len(planned)), mp_context=get_context("spawn")) as pool:
+            logs = list(pool.map(_flown, planned, chunksize=max(1, min(8, len(planned) // (2 * workers)))))
+    else:
+        logs = [_flown(one) for one in planned]
     if not configuration.exists():
         configuration.write_text(text, encoding="utf-8")
     return sorted(logs)
+
+
+def _flown(planned: tuple[Path, str, Experiment, datetime, str]) -> Path:
+    """Fly and write one flight; the log."""
+    session, name, experiment, start, log_format = planned
+    return write_flight(session, name, simulate(experiment), start, log_format=log_format)
 
 
 def _varied(e: Experiment, vehicle: int) -> Experiment:

@@ -381,3 +381,13 @@ def test_the_archives_configuration_is_that_of_the_simulated_vehicle(tmp_path: P
 def test_unknown_format_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="mcap"):
         write_flights(tmp_path, log_format="bag")
+
+
+def test_logs_do_not_depend_on_how_many_processes_fly(tmp_path: Path) -> None:
+    logs = []
+    for workers in (1, 2):
+        folder = tmp_path / str(workers)
+        found = write_flights(folder, Experiment(seed=4, duration_s=6.0), vehicles=2, flights=2, workers=workers)
+        logs.append({path.relative_to(folder): path.read_bytes() for path in found})
+    assert len(logs[0]) == 4
+    assert logs[0] == logs[1]
