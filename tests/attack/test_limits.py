@@ -18,7 +18,7 @@ from outside_ci import outside_ci
 from fieldcal.batch import watchdog
 from fieldcal.batch.limits import why_ended
 from fieldcal.batch.steps import FlightWork
-from fieldcal.config.configuration import Configuration, Document, Limits, Vehicle, load
+from fieldcal.config.configuration import Configuration, Document, Limits, LimitsTable, Vehicle, load
 from fieldcal.config.reader_settings import reader_settings
 from fieldcal.flight.job import Job
 from fieldcal.flows.run import dry_run, run_night
@@ -136,7 +136,7 @@ def test_a_note_holds_until_limits_configuration_or_content_change(tmp_path: Pat
 
 
 def test_limits_enter_no_run_key(tmp_path: Path) -> None:
-    narrow = Configuration(None, Document(limits=Limits(seconds=1.0, cpu_seconds=1.0, memory_mb=1.0)))
+    narrow = Configuration(None, Document(limits=LimitsTable(seconds=1.0, cpu_seconds=1.0, memory_mb=1.0)))
     assert reader_settings(narrow.vehicle("v")) == reader_settings(load(None).vehicle("v"))
     assert narrow.vehicle("v").settings() == load(None).vehicle("v").settings()
     job = Job("/a/v/s/log.csv", "v/s/log.csv", "v", "s", "csv", "0" * 64, "0" * 16)

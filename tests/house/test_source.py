@@ -73,3 +73,9 @@ def test_numeric_columns_have_units() -> None:
         for column in table.columns:
             assert column.meaning, f"{table.name}.{column.name}"
             assert column.unit or not column.numeric, f"{table.name}.{column.name}"
+
+
+def test_no_two_files_of_tests_have_one_name() -> None:
+    """Their folders are no packages: the second one would not be collected."""
+    names = [path.name for path in Path(__file__).parents[1].rglob("test_*.py")]
+    assert len(names) == len(set(names))

@@ -267,6 +267,7 @@ def test_pointer_and_keyboard_read_the_values_of_the_history(browser: Any, site:
     assert own["flight_id"][0] in readout.text
     assert browser.execute_script("return getComputedStyle(document.activeElement).outlineStyle") != "none"
     chart.find_element("css selector", "details summary").click()
+    until(lambda: chart.find_elements("css selector", ".values tbody tr"))  # made when it opens
     cells = [row.text for row in chart.find_elements("css selector", ".values tbody tr")]
     assert len([one for one in cells if one.startswith("x flights") or one.startswith("x before")]) == len(own)
 
