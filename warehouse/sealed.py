@@ -1,4 +1,4 @@
-"""Small JSON records that carry their own digest, so that a changed byte is found."""
+"""Small records that carry their own digest, so that a changed byte is found."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from fieldcal.names import Json
 
 _SEAL = "sealed_sha256"
 _END = b"\n}\n"
+_DIGEST_BYTES = 32
 
 
 class BrokenSeal(ValueError):
@@ -49,6 +50,25 @@ def unseal(data: bytes) -> dict[str, Json]:
         raise BrokenSeal("it is not JSON") from error
     del record[_SEAL]
     return record
+
+
+def seal_bytes(data: bytes) -> bytes:
+    """Content of any kind behind its digest."""
+    return hashlib.sha256(data).digest() + data
+
+
+def unseal_bytes(data: bytes) -> bytes:
+    """The content of `seal_bytes`.
+
+    Raises
+    ------
+    BrokenSeal
+        A byte differs from what was written.
+    """
+    digest, content = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
+    if hashlib.sha256(content).digest() != digest:
+        raise BrokenSeal("it is not what was written")
+    return content
 
 
 def _formerly_sealed(data: bytes) -> bool:

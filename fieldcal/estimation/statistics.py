@@ -126,6 +126,33 @@ def colour(residual: ArrayLike) -> float:
     return float(np.mean([len(r) / max(independent_samples(column), 1e-9) for column in r.T]))
 
 
+def low_frequency_density(x: ArrayLike, lags: int, *, together: int, largest: float) -> Array:
+    """Density at low frequency over that of white noise of the same variance, from the tapered autocorrelation.
+
+    Parameters
+    ----------
+    x : (n, r) array
+        Residuals in order of time.
+    lags : int
+        The longest correlation that is looked at, samples.
+    together : int
+        So many columns, one beside the other, share a density.
+    largest : float
+        1 at least, this at most.
+
+    Returns
+    -------
+    (r / together,) array
+    """
+    x = np.asarray(x, dtype=float)
+    size = fft.next_fast_len(len(x) + lags + 1, real=True)
+    correlation = fft.irfft(np.abs(fft.rfft(x, size, axis=0)) ** 2, size, axis=0)[: lags + 1]
+    of_lag = correlation.reshape(lags + 1, x.shape[1] // together, together).sum(axis=2)
+    taper = 1.0 - np.arange(1, lags + 1) / (lags + 1)
+    density = 1.0 + 2.0 * (taper @ of_lag[1:]) / np.maximum(of_lag[0], 1e-300)
+    return np.asarray(np.clip(density, 1.0, largest))
+
+
 def least_squares_covariance(
     sensitivity: ArrayLike, residual: ArrayLike, *, nuisance: int = 0, steady_over: int | None = None
 ) -> tuple[Array, Array]:

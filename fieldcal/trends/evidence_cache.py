@@ -17,6 +17,7 @@ from fieldcal.estimation.segments import run_starts
 from fieldcal.trends.evidence import ESTIMATES, Evidence, evidence
 from fieldcal.trends.series import Histories
 from fieldcal.warehouse.files import write_bytes
+from fieldcal.warehouse.sealed import BrokenSeal, seal_bytes, unseal_bytes
 
 PLACE = Path("night") / "drift_evidence.npz"
 BY_ROW = tuple(field.name for field in fields(Evidence) if field.name not in ("estimates", "kept"))
@@ -54,8 +55,7 @@ class Memory:
         sizes = np.array([[len(e.unit), len(e.kept)] for e in several])
         stream = io.BytesIO()
         np.savez_compressed(stream, keys=np.array(keys), sizes=sizes, **arrays)
-        data = stream.getvalue()
-        write_bytes(self._path, hashlib.sha256(data).digest() + data, durable=False)
+        write_bytes(self._path, seal_bytes(stream.getvalue()), durable=False)
 
     def _one(self, h: Histories) -> Evidence:
         key = _key(h, self._code)
@@ -105,12 +105,10 @@ def _joined(several: list[Evidence]) -> Evidence:
 
 def _read(path: Path) -> Iterator[tuple[str, Evidence]]:
     try:
-        data = path.read_bytes()
-    except OSError:
+        data = unseal_bytes(path.read_bytes())
+    except (OSError, BrokenSeal):
         return
-    if hashlib.sha256(data[32:]).digest() != data[:32]:
-        return
-    with np.load(io.BytesIO(data[32:]), allow_pickle=False) as stored:
+    with np.load(io.BytesIO(data), allow_pickle=False) as stored:
         arrays: Arrays = {name: stored[name] for name in stored.files}
     if set(arrays) != {"keys", "sizes", "kept", *BY_ROW, *(f"estimate_{name}" for name in ESTIMATES)}:
         return

@@ -168,3 +168,21 @@ def test_the_power_density_is_welchs(n: int, length: int) -> None:
     at, expected = signal.welch(x, 100.0, nperseg=length, axis=0)
     np.testing.assert_allclose(frequency, at)
     np.testing.assert_allclose(density, expected, atol=1e-12 * expected.max())
+
+
+def test_the_density_at_low_frequency_is_that_of_the_tapered_sum() -> None:
+    """Of a first-order process near (1 + φ)/(1 − φ); columns that stand together share one; bounded on either side."""
+    rng = np.random.default_rng(8)
+    x = autoregressive(rng, (4000, 4), 0.5)
+    lags = 60
+    taper = 1.0 - np.arange(1, lags + 1) / (lags + 1)
+    of_lag = np.array(
+        [[np.sum(x[k:, i : i + 2] * x[: len(x) - k, i : i + 2]) for i in (0, 2)] for k in range(lags + 1)]
+    )
+    expected = 1.0 + 2.0 * taper @ of_lag[1:] / of_lag[0]
+    found = statistics.low_frequency_density(x, lags, together=2, largest=400.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    np.testing.assert_allclose(found, 3.0, rtol=0.2)
+    np.testing.assert_array_equal(statistics.low_frequency_density(x, lags, together=2, largest=2.0), [2.0, 2.0])
+    alternating = x[:, :1] * np.where(np.arange(len(x)) % 2 == 0, 1.0, -1.0)[:, None]
+    np.testing.assert_array_equal(statistics.low_frequency_density(alternating, lags, together=1, largest=9.0), [1.0])

@@ -32,15 +32,23 @@ from fieldcal.estimation.by_velocity.problem import (
     Levels,
     State,
     layout_of,
+    of_other_form,
     place_knots,
 )
 from fieldcal.estimation.by_velocity.start import attitudes, velocities_at_knots
 from fieldcal.estimation.by_velocity.strapdown import Grid, Integrated, grid_of, integrate
 from fieldcal.estimation.gyroscope.output_error import propagate_stretches
 from fieldcal.estimation.joint.problem import PriorConstants, Readings
+from fieldcal.estimation.joint.variance_components import COLOUR_S, LARGEST_COLOUR
 from fieldcal.estimation.segments import run_bounds
 from fieldcal.estimation.smoothing import fill, lattice
-from fieldcal.estimation.statistics import huber_inflation, power_density, robust_sigma, variance_by_blocks
+from fieldcal.estimation.statistics import (
+    huber_inflation,
+    low_frequency_density,
+    power_density,
+    robust_sigma,
+    variance_by_blocks,
+)
 from fieldcal.geometry.rotation import (
     Array,
     body_from_inertial,
@@ -79,8 +87,6 @@ LEAST_TURN, LEAST_PUSH = 1e-10, 1e-8
 # Band in which readings are noise, not motion, Hz, and parts whose spectra are averaged, s.
 NOISE_HZ, SPECTRUM_S = (10.0, 40.0), 4.0
 LARGEST_TURN_RAD, LARGEST_LAG_STEP_S = 0.5, 0.05
-# Longest correlation that a residual's density takes in, s, and the largest density over that of white noise.
-COLOUR_S, LARGEST_COLOUR = 3.0, 400.0
 
 
 @dataclass(frozen=True)
@@ -112,11 +118,8 @@ class VelocityFit:
         covariance = self.covariance[columns, columns]
         if name != "magnetometer":
             return value[:3], value[3:], covariance
-        gain, zero = value[:3], value[3:]
-        jacobian = np.block(
-            [[np.diag(-1.0 / gain**2), np.zeros((3, 3))], [np.diag(zero / gain**2), np.diag(-1.0 / gain)]]
-        )
-        return 1.0 / gain, -zero / gain, jacobian @ covariance @ jacobian.T
+        other, jacobian = of_other_form(value)
+        return other[:3], other[3:], jacobian @ covariance @ jacobian.T
 
     def attitude(self, readings: Readings) -> Array:
         """At every sample (n, 4), sensor axes, NED: the gyroscope's integral turned onto the knots."""
@@ -213,8 +216,7 @@ class _Fit:
         values = {name: np.concatenate(start[name]) for name in TRIADS if name in start}
         with_field = "magnetometer" in start and _between(readings, self.knots.offset) >= FEWEST_FIELDS
         if with_field:
-            scale, bias = start["magnetometer"]
-            values["magnetometer"] = np.r_[1.0 / scale, -bias / scale]
+            values["magnetometer"], _ = of_other_form(values["magnetometer"])
             values |= {"field": np.zeros(2), "delay": np.zeros(1)}
         else:
             values.pop("magnetometer", None)
@@ -383,7 +385,8 @@ class _Fit:
                 continue
             x = after[which][:, columns]
             interval_s = float(np.median(np.diff(self.knots.offset[rows[which].knot])))
-            out[place] = _density(x, int(np.clip(COLOUR_S / interval_s, 1, len(x) // 4)))
+            lags = int(np.clip(COLOUR_S / interval_s, 1, len(x) // 4))
+            out[place] = low_frequency_density(x, lags, together=x.shape[1], largest=LARGEST_COLOUR)[0]
         return out
 
     def _result(
@@ -449,13 +452,6 @@ def _walk(readings: Readings, logged: Array, scale: Array) -> float:
     low = min(NOISE_HZ[0], 0.5 * frequency[-1])
     band = (frequency >= low) & (frequency <= max(NOISE_HZ[1], low))
     return 0.5 * float(np.mean(np.median(density[band], axis=0)))
-
-
-def _density(x: Array, lags: int) -> float:
-    """Density at low frequency over that of white noise, from the tapered autocorrelation of x (m, c)."""
-    of_lag = np.array([np.sum(x[lag:] * x[: len(x) - lag]) for lag in range(lags + 1)])
-    taper = 1.0 - np.arange(1, lags + 1) / (lags + 1)
-    return float(np.clip(1.0 + 2.0 * (taper @ of_lag[1:]) / max(of_lag[0], 1e-300), 1.0, LARGEST_COLOUR))
 
 
 def _diverged() -> EstimationError:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fieldcal.estimation.by_velocity.fit import VelocityFit
-from fieldcal.estimation.by_velocity.problem import TRIADS
+from fieldcal.estimation.by_velocity.problem import TRIADS, of_other_form
 from fieldcal.estimation.joint.information import AXES, GAIN, ZERO
 from fieldcal.estimation.normal_equations import Name, NormalEquations
 
@@ -25,13 +25,8 @@ def observed(fit: VelocityFit) -> NormalEquations:
     value, jacobian = np.zeros(6 * len(triads)), np.zeros((6 * len(triads), 6 * len(triads)))
     for place, name in enumerate(triads):
         published += [(name, parameter, axis) for parameter in (GAIN, ZERO) for axis in AXES]
-        one, other = fit.state.values[name][:3], fit.state.values[name][3:]
+        own_form = fit.state.values[name]
         at = slice(6 * place, 6 * place + 6)
-        if name == "magnetometer":
-            value[at], jacobian[at, at] = np.r_[one, other], np.eye(6)
-        else:
-            value[at] = np.r_[1.0 / one, -other / one]
-            jacobian[at, at] = np.block(
-                [[np.diag(-1.0 / one**2), np.zeros((3, 3))], [np.diag(other / one**2), np.diag(-1.0 / one)]]
-            )
+        is_gain = name == "magnetometer"
+        value[at], jacobian[at, at] = (own_form, np.eye(6)) if is_gain else of_other_form(own_form)
     return own.as_function(published, value, jacobian)

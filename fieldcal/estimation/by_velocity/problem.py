@@ -106,6 +106,14 @@ class State:
         return replace(self, values={**self.values, **changes})
 
 
+def of_other_form(constants: Array) -> tuple[Array, Array]:
+    """A triad's scale and bias (6,) as gain and zero, or these as those, and ∂ of them (6, 6): both ways are one map,
+    (1/λ, −b/λ)."""
+    one, other = constants[:3], constants[3:]
+    jacobian = np.block([[np.diag(-1.0 / one**2), np.zeros((3, 3))], [np.diag(other / one**2), np.diag(-1.0 / one)]])
+    return np.r_[1.0 / one, -other / one], jacobian
+
+
 def layout_of(names: Mapping[str, Array]) -> dict[str, slice]:
     """Where each unknown's columns are."""
     out, at = {}, 0

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
 from fieldcal.estimation.joint.problem import Model, State, Trajectory
 from fieldcal.estimation.segments import true_runs
-from fieldcal.estimation.statistics import robust_sigma
+from fieldcal.estimation.statistics import low_frequency_density, robust_sigma
 from fieldcal.geometry.rotation import Array
 
 # Length of a three-axis residual, in sd, beyond which a reading loses influence: χ²₃ exceeds it once in a thousand.
@@ -163,10 +162,5 @@ def slow_colour(model: Model, residual: Array, weight: Array) -> Array:
 
 
 def _colour(x: Array, lags: int, largest: float) -> Array:
-    """From the tapered autocorrelation of x (m, r), the axes of a triad together."""
-    size = fft.next_fast_len(len(x) + lags + 1, real=True)
-    correlation = fft.irfft(np.abs(fft.rfft(x, size, axis=0)) ** 2, size, axis=0)[: lags + 1]
-    by_triad = correlation.reshape(lags + 1, -1, 3).sum(axis=2)
-    taper = 1.0 - np.arange(1, lags + 1) / (lags + 1)
-    colour = 1.0 + 2.0 * (taper @ by_triad[1:]) / np.maximum(by_triad[0], 1e-300)
-    return np.repeat(np.clip(colour, 1.0, largest), 3)
+    """Of each column of x (m, r), the axes of a triad together."""
+    return np.repeat(low_frequency_density(x, lags, together=3, largest=largest), 3)

@@ -22,8 +22,19 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import FIELD_ASSUMED, SENSORS, Json, Method, Rung, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.attitude import vector_constants
-from fieldcal.stages.inputs import Tables, mean_temperature, reference_reading
-from fieldcal.stages.joint.found import UNITS, Found, axes_of, chosen, found_of, priors, trajectory_table
+from fieldcal.stages.inputs import Tables, mean_temperature
+from fieldcal.stages.joint.found import (
+    UNITS,
+    Found,
+    axes_of,
+    chosen,
+    constant_rows,
+    found_of,
+    priors,
+    refusals,
+    status_of,
+    trajectory_table,
+)
 from fieldcal.stages.joint.information import table_of
 from fieldcal.stages.joint.judgement import (
     INFORMED_SHARE,
@@ -33,8 +44,8 @@ from fieldcal.stages.joint.judgement import (
     SCALE_ALONE,
     judged_scales,
 )
-from fieldcal.stages.results import StageResult, quantity_rows, triad_rows
-from fieldcal.stages.tables import AXES, CalibrationRow, calibration_rows, covariance_table, matrix, seconds, triad
+from fieldcal.stages.results import StageResult, quantity_rows
+from fieldcal.stages.tables import AXES, CalibrationRow, calibration_rows, covariance_table, matrix, seconds
 
 if TYPE_CHECKING:
     from fieldcal.config.stage_settings import JointSettings
@@ -191,24 +202,9 @@ def _written(
     fit: VelocityFit, triads: Mapping[Sensor, Found], readings: Readings, tables: Tables, s: JointSettings
 ) -> StageResult:
     axes, temperature = axes_of(s), mean_temperature(tables)
-    rows: list[CalibrationRow] = []
-    for sensor, found in triads.items():
-        rows += triad_rows(
-            sensor,
-            Method.VELOCITY,
-            found.matrix,
-            found.bias,
-            found.covariance,
-            unit=UNITS[sensor] or s.field_unit,
-            logged_unit=s.units[sensor],
-            reference_reading=reference_reading(s, sensor, matrix(tables["samples"], triad(sensor))),
-            temperature_degc=temperature,
-            reason_code=found.codes,
-            zero_reason_code=found.zero_codes,
-        )
+    rows = constant_rows(triads, Method.VELOCITY, tables, s)
     rows += _receiver_rows(fit, triads, axes, temperature)
-    codes = [(f"{name} {axis}", c) for name, v in triads.items() for axis, c in zip(AXES, v.codes, strict=True) if c]
-    every = all(code for found in triads.values() for code in (*found.codes, *found.zero_codes))
+    codes = refusals(triads)
     reason = None
     if codes:
         reason = f"Refused by the receiver's velocity ({', '.join(f'{axis}: {code}' for axis, code in codes)})."
@@ -221,7 +217,7 @@ def _written(
         result["trajectory"] = trajectory_table(fit.attitude(readings), tables, axes)
     return StageResult(
         result,
-        Status.REFUSED if every else Status.OK,
+        status_of(triads),
         next((code for _, code in codes), None),
         reason,
         _measured(fit, triads, axes, len(readings.t)),

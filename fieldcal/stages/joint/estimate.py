@@ -30,18 +30,26 @@ from fieldcal.stages.joint.by_vps import (
     not_used,
     poses_of,
 )
-from fieldcal.stages.joint.found import UNITS, Found, axes_of, chosen, found_of, priors, trajectory_table
+from fieldcal.stages.joint.found import (
+    UNITS,
+    Found,
+    axes_of,
+    chosen,
+    constant_rows,
+    found_of,
+    priors,
+    refusals,
+    status_of,
+    trajectory_table,
+)
 from fieldcal.stages.joint.information import information_of
 from fieldcal.stages.joint.judgement import judged, judged_scales, measured_of, triad_of
 from fieldcal.stages.joint.readings import readings_of, start_constants
 from fieldcal.stages.results import StageResult, fatal_fault, fault_rows, triad_rows, zero_slope_rows
 from fieldcal.stages.tables import (
-    AXES,
     CalibrationRow,
     calibration_rows,
     covariance_table,
-    matrix,
-    triad,
 )
 from fieldcal.stages.vps_poses import AdmittedPoses
 
@@ -223,22 +231,7 @@ def _written(
 ) -> StageResult:
     """Rows with a status by sensor and axis, the attitude, the covariance, and the numbers that decided. `attitude`
     (n, 4) of the sensor axes, NED; `by_pose`: what a VPS's trajectory gives of each vector triad, or why nothing."""
-    rows: list[CalibrationRow] = []
-    for sensor, found in triads.items():
-        rows += triad_rows(
-            sensor,
-            Method.JOINT,
-            found.matrix,
-            found.bias,
-            found.covariance,
-            unit=UNITS[sensor] or s.field_unit,
-            logged_unit=s.units[sensor],
-            reference_reading=reference_reading(s, sensor, matrix(tables["samples"], triad(sensor))),
-            temperature_degc=mean_temperature(tables),
-            reason_code=found.codes,
-            zero_reason_code=found.zero_codes,
-            cross_sd=found.cross_sd,
-        )
+    rows = constant_rows(triads, Method.JOINT, tables, s)
     if Sensor.GYROSCOPE in triads:
         rows += _slope_rows(fit, tables, s, triads[Sensor.GYROSCOPE].zero_codes)
     told = [name for name, v in triads.items() if None in (*v.codes, *v.zero_codes)]
@@ -250,8 +243,7 @@ def _written(
         gyroscope_unit=s.units[Sensor.GYROSCOPE],
         temperature_degc=mean_temperature(tables),
     )
-    codes = [(f"{name} {axis}", c) for name, v in triads.items() for axis, c in zip(AXES, v.codes, strict=True) if c]
-    every = all(code for found in triads.values() for code in (*found.codes, *found.zero_codes))
+    codes = refusals(triads)
     first = next((code for _, code in codes), None)
     parts = []
     if codes:
@@ -275,7 +267,7 @@ def _written(
     )
     if fit.vps is not None or not any(_of_fit(fit, Sensor.GYROSCOPE, s).codes):
         result["trajectory"] = trajectory_table(attitude, tables, axes_of(s))
-    return StageResult(result, Status.REFUSED if every else Status.OK, first, reason, measured)
+    return StageResult(result, status_of(triads), first, reason, measured)
 
 
 def _slope_rows(

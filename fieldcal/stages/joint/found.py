@@ -3,6 +3,7 @@ attitude as a table."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,11 +13,12 @@ import polars as pl
 from fieldcal.estimation.joint.problem import PriorConstants
 from fieldcal.geometry import sensor_model
 from fieldcal.geometry.rotation import Array, from_matrix, multiply
-from fieldcal.names import SENSORS, Approach, Sensor
+from fieldcal.names import SENSORS, Approach, Method, Sensor, Status
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.stages.inputs import Tables
+from fieldcal.stages.inputs import Tables, mean_temperature, reference_reading
 from fieldcal.stages.joint.judgement import judged_zeros
-from fieldcal.stages.tables import QUATERNION, columns_of
+from fieldcal.stages.results import triad_rows
+from fieldcal.stages.tables import AXES, QUATERNION, CalibrationRow, columns_of, matrix, triad
 
 if TYPE_CHECKING:
     from fieldcal.config.stage_settings import JointSettings
@@ -80,6 +82,40 @@ def priors(s: JointSettings) -> dict[str, PriorConstants]:
 def axes_of(s: JointSettings) -> Array:
     """Sensor axes into body axes, (3, 3)."""
     return sensor_model.frd_from_sensor(s.rotation_body_from_sensor, s.body)
+
+
+def constant_rows(
+    triads: Mapping[Sensor, Found], method: Method, tables: Tables, s: JointSettings
+) -> list[CalibrationRow]:
+    """Scale, bias and zero of each triad, with its refusals."""
+    rows: list[CalibrationRow] = []
+    for sensor, found in triads.items():
+        rows += triad_rows(
+            sensor,
+            method,
+            found.matrix,
+            found.bias,
+            found.covariance,
+            unit=UNITS[sensor] or s.field_unit,
+            logged_unit=s.units[sensor],
+            reference_reading=reference_reading(s, sensor, matrix(tables["samples"], triad(sensor))),
+            temperature_degc=mean_temperature(tables),
+            reason_code=found.codes,
+            zero_reason_code=found.zero_codes,
+            cross_sd=found.cross_sd,
+        )
+    return rows
+
+
+def refusals(triads: Mapping[Sensor, Found]) -> list[tuple[str, ReasonCode]]:
+    """(axis, why) of each scale that is refused."""
+    return [(f"{name} {axis}", c) for name, v in triads.items() for axis, c in zip(AXES, v.codes, strict=True) if c]
+
+
+def status_of(triads: Mapping[Sensor, Found]) -> Status:
+    """Refused where every scale and zero is."""
+    every = all(code for found in triads.values() for code in (*found.codes, *found.zero_codes))
+    return Status.REFUSED if every else Status.OK
 
 
 def trajectory_table(attitude: Array, tables: Tables, axes: Array) -> pl.DataFrame:

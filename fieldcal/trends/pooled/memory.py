@@ -19,10 +19,10 @@ from polars.exceptions import PolarsError
 from fieldcal.estimation.pooled.strengths import Strengths
 from fieldcal.estimation.pooled.unit import Kinds
 from fieldcal.warehouse.files import write_bytes
+from fieldcal.warehouse.sealed import seal_bytes, unseal_bytes
 from fieldcal.warehouse.store import empty_frame
 
 PLACE = Path("night") / "pooled.bin"
-DIGEST_BYTES = 32
 OF = "of"
 """Column of the kept rows: the key of the unit that they are of."""
 
@@ -72,17 +72,13 @@ class Memory:
         stream = io.BytesIO()
         stream.write(json.dumps(head).encode() + b"\n")
         rows.write_ipc(stream, compression="zstd")
-        data = stream.getvalue()
-        write_bytes(self._path, hashlib.sha256(data).digest() + data, durable=False)
+        write_bytes(self._path, seal_bytes(stream.getvalue()), durable=False)
 
 
 def _read(path: Path) -> tuple[tuple[str, Kinds], dict[str, pl.DataFrame]]:
     nothing: tuple[tuple[str, Kinds], dict[str, pl.DataFrame]] = ("", {}), {}
     try:
-        data = path.read_bytes()
-        if hashlib.sha256(data[DIGEST_BYTES:]).digest() != data[:DIGEST_BYTES]:
-            return nothing
-        head, _, content = data[DIGEST_BYTES:].partition(b"\n")
+        head, _, content = unseal_bytes(path.read_bytes()).partition(b"\n")
         told = json.loads(head)
         rows = pl.read_ipc(io.BytesIO(content))
         if rows.schema != _nothing().schema:  # an older release's
