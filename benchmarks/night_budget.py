@@ -1,11 +1,11 @@
 """Where a flight's processor time goes in a night, beside what it was at the last release.
 
-    python benchmarks/night_budget.py [--flights 20] [--keep]
+    python benchmarks/night_budget.py [--flights 20] [--no-vps] [--keep]
 
-Simulated flights of 40 s at 185 Hz with a VPS, through all steps in this process, without Prefect, then the night's own
-work on them: planning it when everything is new and when nothing is, publishing, closing. Seconds of the processor a
-flight, the share of all, and the ratio to `night_budget.json`, which `--keep` writes anew: machines differ, ratios
-of one machine's runs mean something.
+Simulated flights of 40 s at 185 Hz, with a VPS or without, through all steps in this process, without Prefect, then
+the night's own work on them: planning it when everything is new and when nothing is, publishing, closing. Seconds of
+the processor a flight, the share of all, and the ratio to `night_budget.json`, which `--keep` writes anew: machines
+differ, ratios of one machine's runs mean something.
 """
 
 from __future__ import annotations
@@ -71,6 +71,7 @@ def main() -> None:
     """Print the table."""
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("--flights", type=int, default=20)
+    arguments.add_argument("--no-vps", action="store_true")
     arguments.add_argument("--keep", action="store_true")
     given = arguments.parse_args()
     budget = Budget()
@@ -81,7 +82,7 @@ def main() -> None:
     with one_thread(), tempfile.TemporaryDirectory() as folder:
         archive, root = Path(folder) / "archive", Path(folder) / "data"
         with budget.on("simulate (not in a night)"):
-            flown = Experiment(seed=1, dip_rad=np.radians(60.0), translation_rms_mps2=0.1)
+            flown = Experiment(seed=1, dip_rad=np.radians(60.0), translation_rms_mps2=0.1, vps=not given.no_vps)
             write_flights(archive, flown, sessions=given.flights)
         plan_night(archive, root)  # parses the source, once a process
         with budget.on("plan, everything new"):

@@ -1,5 +1,4 @@
-"""Processes end in time: a worker with the process that started it, `serve` with its server, and none waits for one
-that is gone.
+"""Processes end in time: `serve` with its server, and none waits for one that is gone.
 
 Prefect tells its server of every task from a queue, and at exit waits until all has been told: for ever, if nobody
 listens any more. Its records are worth an attempt, not a night.
@@ -7,7 +6,6 @@ listens any more. Its records are worth an attempt, not a night.
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import threading
 import time
@@ -20,23 +18,11 @@ ATTEMPTS = 3
 LOOK_EVERY_S = 2.0
 
 
-def end_with_parent() -> None:
-    """End this process, at once, when the one that started it is gone, killed say; whatever is on disk is whole."""
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-
-    def wait() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
 def end_with_server(lives: Callable[[], bool], sentence: str) -> None:
     """End this process with exit code 1 and a sentence when the server that it hosts schedules for is gone.
 
-    At once: what would be said goodbye to is the server. The runs it had started end with it (`end_with_parent`).
+    At once: what would be said goodbye to is the server. The runs it had started end with it
+    (`end_with_parent`).
     """
 
     def wait() -> None:

@@ -13,6 +13,7 @@ from prefect.states import Failed
 from fieldcal.batch.closing import close_night
 from fieldcal.batch.documents import Answer, Batch, NightDocument, PlainOutcome
 from fieldcal.batch.flights import lost
+from fieldcal.batch.ledgers.room import make_room
 from fieldcal.batch.night import Night, Watcher, plan_night, publishings
 from fieldcal.batch.outcome import Outcome
 from fieldcal.batch.telling import telling
@@ -141,7 +142,12 @@ def carry_out(
         for publishing in publishings(night, outcomes):
             publish_as_task(publishing)
         night.remember(outcomes)
-        closing = close_night(night.root, Criteria.of(night.configuration), with_site=night.configuration.writes_site)
+        with_site = night.configuration.writes_site
+        closing = close_night(
+            night.root, Criteria.of(night.configuration), with_site=with_site, workers=parallel.here()
+        )
+        if outcomes:
+            make_room(night)
         result = night.document(outcomes, closing)
         keep_artifact(result, night.root)
         tell_prefect(closing.changes)

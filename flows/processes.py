@@ -19,7 +19,8 @@ from typing import Any, Self
 from fieldcal.batch.documents import Answer, Batch
 from fieldcal.batch.flights import flights
 from fieldcal.batch.limits import notes
-from fieldcal.flows.farewell import end_with_parent, tell_while_heard
+from fieldcal.flight.processes import end_with_parent
+from fieldcal.flows.farewell import tell_while_heard
 from fieldcal.flows.runners import Answers, answer_of
 
 LISTEN_S = 0.25

@@ -66,6 +66,10 @@ class Parallel:
             )
             raise FieldcalError(ReasonCode.WRONG_OPTION, told)
 
+    def here(self) -> int:
+        """How many processes of this machine the night may keep busy."""
+        return self.workers if self.runner == "process" else 1
+
     def spawned(self, n_batches: int) -> int:
         """How many processes of this machine so many batches keep busy; one too, for a log may have its own ended."""
         return min(self.workers, n_batches) if self.runner == "process" else 0

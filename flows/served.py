@@ -18,7 +18,7 @@ from fieldcal.batch.documents import NightDocument
 from fieldcal.batch.night import plan_night
 from fieldcal.batch.session_folder import archive_of
 from fieldcal.errors import FieldcalError
-from fieldcal.flows.farewell import end_with_parent
+from fieldcal.flight.processes import end_with_parent
 from fieldcal.flows.nightly import carry_out, told_apart
 from fieldcal.flows.runners import Parallel
 from fieldcal.flows.trigger import trigger

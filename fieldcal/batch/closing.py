@@ -38,13 +38,13 @@ class Closing:
     site: Path | None = None
 
 
-def close_night(root: Path, criteria: Criteria, *, with_site: bool = True) -> Closing:
+def close_night(root: Path, criteria: Criteria, *, with_site: bool = True, workers: int = 1) -> Closing:
     """Bring trends and reports up to the history; what is to be told tonight that was not told before.
 
     Trends are regressed only where the history, or the code that makes them, is another than last time. The fleet is
     judged once: the site, the terminal and messages say the same. Reports: the fleet's page, and the pages of vehicles
     of which something is told; `fieldcal report` makes any other. The site has all of them, and of it only what changed
-    is written.
+    is written, by so many `workers`.
 
     The history is held against its records first, so that no night ends well over damage that it had no need to read.
 
@@ -73,7 +73,7 @@ def close_night(root: Path, criteria: Criteria, *, with_site: bool = True) -> Cl
         fleet = fleet_fitness(snapshot, criteria, now)
         told = news(fleet, remembered_fleet(root))
         report = _reports(root, told)
-        site = write_pages(snapshot, fleet) if with_site else None
+        site = write_pages(snapshot, fleet, workers) if with_site else None
         made = history_digest(root, FLEET_TABLES)
         remember(root, fleet, criteria, {"made_from": made_from, "made": made})
         share(root)

@@ -270,6 +270,15 @@ class Site(Table):
     )
 
 
+class Room(Table):
+    """How large the warehouse may become."""
+
+    largest_gb: Annotated[
+        Positive | None,
+        _meaning("size beyond which a night removes readings and results of stages of the oldest flights", "GB"),
+    ] = None
+
+
 class Limits(Table):
     """What one log may take of the machine in a night, reading and all stages together. Results do not depend on it."""
 
@@ -308,6 +317,7 @@ class Document(Table):
     alerts: Alerts = Alerts()
     limits: LimitsTable = LimitsTable()
     site: Site = Site()
+    warehouse: Room = Room()
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,15 @@ from fieldcal.site.charts import Chart, Charts, Curve, Panel, View
 from fieldcal.stages.tables import AXES, QUATERNION, constants, matrix, seconds, triad
 
 SHARES = 300
+STEPS_OF_A_RANGE = 1e4
+"""Values of a thinned curve are rounded to no coarser than this part of what it spans: finer than a screen shows."""
 TABLE_OF = {Sensor.GYROSCOPE: "imu", Sensor.ACCELEROMETER: "imu", Sensor.MAGNETOMETER: "magnetometer"}
 SIGNALS = ("imu", "magnetometer", "temperature")
 ATTITUDES = ("joint.trajectory", "attitude_pass2.attitude")
-THINNED = f"Curves: the least and the greatest of each of {SHARES} shares of the flight."
+THINNED = (
+    f"Curves: the least and the greatest of each of {SHARES} shares of the flight, to a {STEPS_OF_A_RANGE:,.0f}th of"
+    " what they span."
+)
 X_NAME = "time since the first reading (s)"
 
 
@@ -99,7 +104,8 @@ def _attitude(data: FlightData, origin: int, charts: Charts) -> Plot | Text:
 
 def envelope(t: Array, values: Array, shares: int = SHARES) -> tuple[Array, Array]:
     """Least and greatest of (n, m) values in each of `shares` parts of (n,) stamps, in the order of their occurrence,
-    (≤ 2·shares + gaps,) and (…, m). NaN stands where samples are missing for more than a share and 10 intervals."""
+    (≤ 2·shares + gaps,) and (…, m), rounded for the eye. NaN stands where samples are missing for more than a share
+    and 10 intervals."""
     keep = np.isfinite(values).any(axis=1)
     t, values = t[keep], values[keep]
     if len(t) > 2 * shares:
@@ -113,12 +119,21 @@ def envelope(t: Array, values: Array, shares: int = SHARES) -> tuple[Array, Arra
         quarter = starts + sizes // 4
         x = np.column_stack([t[quarter], t[np.minimum(starts + 3 * sizes // 4, starts + sizes - 1)]]).ravel()
         x[1::2] = np.maximum(x[1::2], x[::2])
-        t, values = x, out.reshape(-1, values.shape[1])
+        t, values = rounded(x), rounded(out.reshape(-1, values.shape[1]))
     if len(t) < 3:
         return t, values
     step = np.diff(t)
     after = np.flatnonzero(step > max(10.0 * float(np.median(step)), (t[-1] - t[0]) / shares)) + 1
     return np.insert(t, after, t[after - 1]), np.insert(values, after, np.nan, axis=0)
+
+
+def rounded(values: Array) -> Array:
+    """(…) values of (n,) or columns of (n, m), each to a power of ten that is at most a `STEPS_OF_A_RANGE`th of what it
+    spans; NaN stays."""
+    span = np.nanmax(values, axis=0, initial=-np.inf) - np.nanmin(values, axis=0, initial=np.inf)
+    fine = np.where(np.isfinite(span) & (span > 0.0), span, 1.0) / STEPS_OF_A_RANGE
+    per_unit = 10.0 ** -np.floor(np.log10(fine))
+    return np.asarray(np.round(values * per_unit) / per_unit)
 
 
 def _extremes(x: Array, starts: np.ndarray, share: np.ndarray) -> Array:

@@ -35,21 +35,18 @@ class Ledger:
         self.files: Files = {}
         self.flights: Mapping[str, str] = {}
         self.of_flights: Mapping[str, Files] = {}
-        self._path = folder(root) / f"{encode_id(vehicle_id)}.json"
+        self._path = _path(root, vehicle_id)
 
     @staticmethod
     def all_of(root: Path) -> dict[str, Ledger]:
         """By vehicle; those that are damaged are left out, so that their pages are made anew."""
-        found = {}
-        for path in sorted(folder(root).glob("*.json")):
-            try:
-                told = unseal(path.read_bytes())
-                ledger = Ledger(root, str(told["vehicle_id"]))
-                ledger._fill(told)
-            except (OSError, BrokenSeal, KeyError, TypeError, ValueError):
-                continue
-            found[ledger.vehicle_id] = ledger
-        return found
+        found = (_read(root, path) for path in sorted(folder(root).glob("*.json")))
+        return {ledger.vehicle_id: ledger for ledger in found if ledger is not None}
+
+    @staticmethod
+    def of_vehicle(root: Path, vehicle_id: str) -> Ledger:
+        """As it was written last; an empty one where there is none, or a damaged one."""
+        return _read(root, _path(root, vehicle_id)) or Ledger(root, vehicle_id)
 
     def _fill(self, told: Mapping[str, Json]) -> None:
         flights = cast(Mapping[str, tuple[str, Mapping[str, list[str | int]]]], told["flights"])
@@ -118,6 +115,20 @@ class Written:
 def folder(root: Path) -> Path:
     """Where nights remember what of the site they wrote."""
     return root / "night" / SITE
+
+
+def _path(root: Path, vehicle_id: str) -> Path:
+    return folder(root) / f"{encode_id(vehicle_id)}.json"
+
+
+def _read(root: Path, path: Path) -> Ledger | None:
+    try:
+        told = unseal(path.read_bytes())
+        ledger = Ledger(root, str(told["vehicle_id"]))
+        ledger._fill(told)
+    except (OSError, BrokenSeal, KeyError, TypeError, ValueError):
+        return None
+    return ledger
 
 
 def vehicle_digest(snapshot: Snapshot, one: Fitness, code: str) -> str:

@@ -10,12 +10,12 @@ from fieldcal.provenance.run_key import code_digest
 from fieldcal.report.fitness import Criteria, Fitness, fleet_fitness
 from fieldcal.report.links import Links, flight_name, vehicle_name
 from fieldcal.report.standing.memory import remembered_criteria
+from fieldcal.site.drawing import Due, draw
 from fieldcal.site.fleet_pages import compare_page, fleet_data, fleet_page, flights_page
-from fieldcal.site.ledger import Ledger, Written, flight_digest, vehicle_digest
+from fieldcal.site.ledger import Ledger, Written, vehicle_digest
 from fieldcal.site.pages import ASSETS, DATA, Frame, asset, html
 from fieldcal.site.script_data import script
 from fieldcal.site.snapshot import Snapshot
-from fieldcal.site.vehicle_pages import flight_files, vehicle_files
 from fieldcal.warehouse.layout import SITE, prepare
 from fieldcal.warehouse.questions import existing
 from fieldcal.warehouse.remote.pages import at_hand
@@ -46,8 +46,8 @@ def write_site(root: Path, criteria: Criteria | None = None, *, now: datetime | 
     )
 
 
-def write_pages(snapshot: Snapshot, fitness: Mapping[str, Fitness]) -> Path:
-    """The same, of what is judged already."""
+def write_pages(snapshot: Snapshot, fitness: Mapping[str, Fitness], workers: int = 1) -> Path:
+    """The same, of what is judged already; `workers` processes share the vehicles where many pages are to be drawn."""
     root = snapshot.root
     prepare(root)
     flights = snapshot.scan("flight").select("vehicle_id", "flight_id").collect()
@@ -56,42 +56,24 @@ def write_pages(snapshot: Snapshot, fitness: Mapping[str, Fitness]) -> Path:
     written = Written(root / SITE)
     ledgers = Ledger.all_of(root)
     code = code_digest()
+    due = []
     for vehicle_id, one in fitness.items():
-        ledger = ledgers.pop(vehicle_id, None) or Ledger(root, vehicle_id)
-        every = flights.filter(vehicle_id=vehicle_id)["flight_id"]
-        own = [flight for flight in every if flight in ledger.of_flights or at_hand(root, flight)]
-        _vehicle(snapshot, one, own, links, ledger, written, code)
+        ledger = ledgers.get(vehicle_id) or Ledger(root, vehicle_id)
+        of = vehicle_digest(snapshot, one, code)
+        if ledger.of != of or not all(written.has(files) for files in (ledger.files, *ledger.of_flights.values())):
+            every = flights.filter(vehicle_id=vehicle_id)["flight_id"]
+            own = (flight for flight in every if flight in ledger.of_flights or at_hand(root, flight))
+            due.append(Due(one, tuple(own), of))
+    draw(snapshot, due, links, code, workers)
+    ledgers |= {one.fitness.vehicle_id: Ledger.of_vehicle(root, one.fitness.vehicle_id) for one in due}
     _fleet(snapshot, fitness, links, written)
-    for ledger in ledgers.values():
-        ledger.forget()
+    for vehicle_id, ledger in ledgers.items():
+        if vehicle_id in fitness:
+            written.keep(ledger)
+        else:
+            ledger.forget()
     written.remove_others()
     return root / SITE / INDEX
-
-
-def _vehicle(
-    snapshot: Snapshot,
-    one: Fitness,
-    flights: list[str],
-    links: Links,
-    ledger: Ledger,
-    written: Written,
-    code: str,
-) -> None:
-    """The vehicle's pages and its flights', where what they show, or the code that makes them, is another."""
-    of = vehicle_digest(snapshot, one, code)
-    if ledger.of == of and all(written.has(files) for files in (ledger.files, *ledger.of_flights.values())):
-        written.keep(ledger)
-        return
-    seen = {}
-    for flight_id in flights:
-        digest = flight_digest(snapshot, one.vehicle_id, flight_id, code)
-        files = ledger.of_flights.get(flight_id, {})
-        if ledger.flights.get(flight_id) != digest or not written.has(files):
-            files = written.put(flight_files(snapshot, one.vehicle_id, flight_id, links), files)
-        seen[flight_id] = (digest, files)
-    files = written.put(vehicle_files(snapshot, one, links), ledger.files)
-    ledger.remember(of, files, seen)
-    written.keep(ledger)
 
 
 def _fleet(snapshot: Snapshot, fitness: Mapping[str, Fitness], links: Links, written: Written) -> None:

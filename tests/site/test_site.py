@@ -6,7 +6,10 @@ import datetime as dt
 import hashlib
 import io
 import json
+import os
 import re
+import shutil
+from concurrent.futures import Future, ProcessPoolExecutor
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -31,11 +34,13 @@ from fieldcal.report.links import flight_name, vehicle_name
 from fieldcal.report.trend import change_sentence
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
-from fieldcal.site import write_site
+from fieldcal.site import drawing, write_site
 from fieldcal.site.charts import numbers
 from fieldcal.site.downloads import ENDINGS
-from fieldcal.site.flight_charts import SHARES, envelope
+from fieldcal.site.flight_charts import SHARES, STEPS_OF_A_RANGE, envelope, rounded
 from fieldcal.site.pages import ASSETS, asset
+from fieldcal.site.snapshot import Snapshot
+from fieldcal.site.write import write_pages
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.publish import publish
 from fieldcal.warehouse.upkeep.verify import verify
@@ -313,7 +318,8 @@ def test_a_night_writes_it_and_the_next_nothing(tmp_path: Path) -> None:
     for curve in as_logged["panels"][0]["curves"]:
         values = [v for v in curve["y"] if v is not None]
         readings = logged[f"gyroscope_{curve['name']}"]
-        assert (min(values), max(values)) == pytest.approx((readings.min(), readings.max()), rel=1e-6)
+        fine = (readings.max() - readings.min()) / STEPS_OF_A_RANGE
+        assert (min(values), max(values)) == pytest.approx((readings.min(), readings.max()), abs=fine)
     night()
     assert changed(first, stamps(tmp_path / "data")) == set()
 
@@ -344,8 +350,9 @@ def test_envelope_keeps_every_peak_and_gap() -> None:
     s, y = envelope(t, x)
     assert np.all(np.diff(s) >= 0)
     assert len(s) <= 2 * SHARES + 2
-    assert np.array_equal(np.nanmax(y, axis=0), x.max(axis=0))
-    assert np.array_equal(np.nanmin(y, axis=0), x.min(axis=0))
+    fine = (x.max(axis=0) - x.min(axis=0)) / STEPS_OF_A_RANGE
+    assert np.all(np.abs(np.nanmax(y, axis=0) - x.max(axis=0)) <= fine / 2)
+    assert np.all(np.abs(np.nanmin(y, axis=0) - x.min(axis=0)) <= fine / 2)
     share = (t[-1] - t[0]) / SHARES
     assert abs(s[np.nanargmax(y[:, 1])] - t[1234]) <= share
     assert abs(s[np.nanargmin(y[:, 2])] - t[8765]) <= share
@@ -355,6 +362,48 @@ def test_envelope_keeps_every_peak_and_gap() -> None:
     few, same = envelope(t[:100], x[:100])
     assert np.array_equal(few, t[:100])
     assert np.array_equal(same, x[:100])
+
+
+@pytest.mark.parametrize("size", [1e-9, 0.03, 1.0, 4e7])
+def test_thinned_values_are_rounded_by_what_they_span(size: float) -> None:
+    x = np.random.default_rng(2).uniform(-size, size, (500, 2)) + np.array([0.0, 7.0 * size])
+    x[3, 0] = np.nan
+    step = np.nanmax(np.abs(rounded(x) - x), axis=0)
+    assert np.all(step <= 2.0 * size / STEPS_OF_A_RANGE / 2.0)
+    assert np.all(step >= 0.04 * 2.0 * size / STEPS_OF_A_RANGE), "as coarse as it may be"
+    assert np.array_equal(np.isnan(rounded(x)), np.isnan(x))
+
+
+def test_values_that_span_nothing_stay() -> None:
+    assert np.all(rounded(np.full((4, 1), 25.03)) == 25.03)
+    assert rounded(np.zeros((0, 3))).shape == (0, 3)
+    assert np.all(np.isnan(rounded(np.full(3, np.nan))))
+
+
+def test_processes_that_share_the_vehicles_write_the_same_site(fleet: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    """Also where one of them is killed: what is left is drawn here."""
+
+    def content(root: Path) -> dict[str, bytes]:
+        return {one.name: one.read_bytes() for one in sorted((root / "site").rglob("*")) if one.is_file()}
+
+    class Killed(ProcessPoolExecutor):
+        def submit(self, *_: Any, **__: Any) -> Future[Any]:
+            return super().submit(os._exit, 1)
+
+    shutil.copytree(fleet, tmp_path / "alone", ignore=shutil.ignore_patterns("site"))
+    shutil.copytree(tmp_path / "alone", tmp_path / "shared")
+    shutil.copytree(tmp_path / "alone", tmp_path / "killed")
+    monkeypatch.setattr(drawing, "FLIGHTS_WORTH_A_PROCESS", 1)
+    for name in ("alone", "shared", "killed"):
+        if name == "killed":
+            monkeypatch.setattr(drawing, "ProcessPoolExecutor", Killed)
+        snapshot = Snapshot(tmp_path / name)
+        judged = fleet_fitness(snapshot, Criteria(Alerts(expires_days=1e5)), NOW)
+        write_pages(snapshot, judged, 1 if name == "alone" else 2)
+    alone = content(tmp_path / "alone")
+    assert len(alone) > 30
+    assert content(tmp_path / "shared") == alone
+    assert content(tmp_path / "killed") == alone
 
 
 def test_numbers_have_seven_digits_and_no_infinity() -> None:

@@ -12,6 +12,7 @@ import pytest
 
 import fieldcal
 from fieldcal.batch.flights import one_flight
+from fieldcal.batch.ledgers.room import make_room
 from fieldcal.batch.night import plan_night, publishings
 from fieldcal.cli.main import run
 from fieldcal.errors import FieldcalError
@@ -135,3 +136,34 @@ def test_the_command_says_first_and_removes_when_it_is_told(fleet: Path, capsys:
     assert run(["prune", "--signals-before", "2999-01-01", *at]) == 2
     assert run(["prune", "--vehicle", "nobody", *at]) == 2
     assert run(["prune", "--warehouse", str(fleet / "nowhere")]) != 0
+
+
+def size_bytes(root: Path) -> int:
+    return sum(path.stat().st_size for path in root.rglob("*") if path.is_file())
+
+
+def test_a_warehouse_is_held_to_its_size_and_no_night_makes_again_what_went(
+    fleet: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, config = fleet / "data", fleet / "archive" / "fieldcal.toml"
+    night(fleet)
+    content, whole = content_sha256(root), size_bytes(root)
+    limit = 0.8 * whole
+    config.write_text(config.read_text() + f"\n[warehouse]\nlargest_gb = {limit / 1e9}\n")
+    make_room(plan_night(fleet / "archive", root))
+    assert size_bytes(root) <= limit
+    told = capsys.readouterr().err
+    assert "largest_gb" in told
+    assert "flew longest ago" in told
+    assert content_sha256(root) == content
+    assert verify(root)["ok"]
+    flights = Warehouse(root).scan("flight").sort("started_at").collect()
+    kept = [
+        (root / "signals" / "imu" / f"vehicle_id={v}" / f"{f}.parquet").exists()
+        for v, f in flights.select("vehicle_id", "flight_id").iter_rows()
+    ]
+    assert kept == sorted(kept), "the oldest go first"
+    assert {True, False} == set(kept)
+    assert night(fleet) == (4, 0), "nothing is made again"
+    make_room(plan_night(fleet / "archive", root))
+    assert capsys.readouterr().err == "", "there is room to spare"

@@ -88,6 +88,18 @@ class Ledger:
         sealed = seal({"flights": {**kept, **flights}, "histories": histories})
         write_bytes(_place(self._root), sealed, durable=False)
 
+    def as_they_were(self, flights: Iterable[str]) -> list[str]:
+        """Those of the flights whose results are as they were when they were remembered."""
+        known = {one: self._flights[one] for one in flights if one in self._flights}
+        return [one for one, seen in known.items() if _stamps(self._root, seen["files"]) == seen["as_they_were"]]
+
+    def let_go(self, flights: Iterable[str]) -> None:
+        """Remember flights whose results were removed since as they are now: there is nothing to do for them."""
+        stamped = {one: _stamps(self._root, self._flights[one]["files"]) for one in flights}
+        of_now = {one: {**self._flights[one], "as_they_were": stamp} for one, stamp in stamped.items()}
+        sealed = seal({"flights": {**self._flights, **of_now}, "histories": self._histories})
+        write_bytes(_place(self._root), sealed, durable=False)
+
     def _seen(self, outcome: Outcome) -> Seen | None:
         job, records = outcome.job, outcome.records
         vehicle = self._configuration.vehicle(job.vehicle_id)
