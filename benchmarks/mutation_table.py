@@ -36,6 +36,7 @@ TESTS: dict[str, Sequence[str]] = {
     "logs.unread": ("logs/test_unread*.py",),
     "estimation": ("estimation/test_*.py",),
     "estimation.by_pose": ("estimation/by_pose/test_*.py",),
+    "estimation.by_velocity": ("estimation/by_velocity/test_*.py",),
     "estimation.clock_sync.by_field": ("estimation/test_clock_by_field*.py",),
     "estimation.clock_sync.by_rates": ("estimation/test_clock_by_rates*.py",),
     "estimation.clock_sync.handedness": ("estimation/test_handedness*.py",),

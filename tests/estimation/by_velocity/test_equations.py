@@ -1,0 +1,136 @@
+"""The chain's normal equations against dense least squares over all unknowns at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fieldcal.estimation.by_velocity.equations import (
+    ATTITUDE_PER_RAD2,
+    FIELD,
+    GROUPS,
+    LEVEL,
+    PUSH,
+    STATES,
+    TURN,
+    VELOCITY_PER_M2S2,
+    VERTICAL,
+    Rows,
+    noise_in_readings,
+    predicted,
+    pulls,
+    solve,
+)
+from fieldcal.estimation.by_velocity.problem import State
+from fieldcal.geometry.rotation import Array, body_from_inertial, normalise
+
+KNOTS, P = 6, 7
+
+
+def some_rows(rng: np.random.Generator) -> list[Rows]:
+    """Links of each knot to the next, epochs and means at some: sensitivities drawn at random."""
+
+    def one(knot: np.ndarray, group: tuple[int, ...], linked: bool) -> Rows:
+        m, r = len(knot), len(group)
+        there = rng.normal(size=(m, r, STATES)) if linked else None
+        here, theta = rng.normal(size=(m, r, STATES)), rng.normal(size=(m, r, P))
+        return Rows(rng.normal(size=(m, r)), here, there, theta, knot, rng.uniform(0.1, 2.0, (m, r)), group)
+
+    return [
+        one(np.arange(KNOTS - 1), (TURN, TURN, TURN, PUSH, PUSH, PUSH), True),
+        one(np.array([0, 2, 3, 5]), (LEVEL, LEVEL, VERTICAL), False),
+        one(np.arange(KNOTS - 1), (FIELD,) * 3, False),
+    ]
+
+
+def dense(rows: list[Rows], weight: list[Array]) -> tuple[Array, Array, np.ndarray]:
+    """All rows whitened, (M, 6K + P), with their residuals (M,) and groups (M,)."""
+    lines, right, group = [], [], []
+    for one, robust in zip(rows, weight, strict=True):
+        for m, knot in enumerate(one.knot):
+            for r in range(one.residual.shape[1]):
+                line = np.zeros(STATES * KNOTS + P)
+                line[STATES * knot : STATES * (knot + 1)] = one.here[m, r]
+                if one.there is not None:
+                    line[STATES * (knot + 1) : STATES * (knot + 2)] = one.there[m, r]
+                line[STATES * KNOTS :] = one.theta[m, r]
+                root = np.sqrt(robust[m, r] / one.variance[m, r])
+                lines.append(root * line)
+                right.append(-root * one.residual[m, r])
+                group.append(one.group[r])
+    return np.array(lines), np.array(right), np.array(group)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_step_is_that_of_dense_least_squares(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows = some_rows(rng)
+    weight = [rng.uniform(0.3, 1.0, one.residual.shape) for one in rows]
+    signs = [rng.choice([-1.0, 1.0], one.residual.shape) for one in rows]
+    prior = np.diag(rng.uniform(0.1, 1.0, P))
+    pulled, score = rng.normal(size=P), rng.normal(size=P)
+    found = solve(rows, weight, KNOTS, (prior, pulled), score, signs)
+
+    a, b, group = dense(rows, weight)
+    n = STATES * KNOTS
+    known = np.zeros((n + P, n + P))
+    known[:n, :n] = np.diag(np.tile([ATTITUDE_PER_RAD2] * 3 + [VELOCITY_PER_M2S2] * 3, KNOTS))
+    without = a.T @ a + known
+    known[n:, n:] = prior
+    total = a.T @ a + known
+    right = a.T @ b
+    right[n:] += pulled + score
+    step = np.linalg.solve(total, right)
+    assert np.allclose(found.theta, step[n:], rtol=1e-8, atol=1e-9)
+    assert np.allclose(found.knots.ravel(), step[:n], rtol=1e-7, atol=1e-8)
+    assert np.allclose(found.covariance, np.linalg.inv(total)[n:, n:], rtol=1e-7, atol=1e-10)
+    carried = np.linalg.solve(without[:n, :n], without[:n, n:])
+    assert np.allclose(found.information, without[n:, n:] - without[n:, :n] @ carried, rtol=1e-8, atol=1e-8)
+    assert np.allclose(found.followed.reshape(n, P), -carried, rtol=1e-7, atol=1e-8)
+    gradient = (a.T @ b)[n:] - without[n:, :n] @ np.linalg.solve(without[:n, :n], (a.T @ b)[:n])
+    assert np.allclose(found.pull, gradient + score, rtol=1e-7, atol=1e-7)
+
+    flat_sign = np.concatenate([own.ravel() for own in signs])
+    theta, knots = found.probes
+    for kind in GROUPS:
+        probe = np.linalg.solve(total, a.T @ np.where(group == kind, flat_sign, 0.0))
+        assert np.allclose(theta[:, kind], probe[n:], rtol=1e-7, atol=1e-8)
+        assert np.allclose(knots[..., kind].ravel(), probe[:n], rtol=1e-7, atol=1e-8)
+
+    changed = np.concatenate([predicted(one, found.theta[:, None], found.knots[..., None]).ravel() for one in rows])
+    root = np.concatenate([np.sqrt(w / one.variance).ravel() for one, w in zip(rows, weight, strict=True)])
+    assert np.allclose(root * changed, a @ step, rtol=1e-7, atol=1e-7)
+    each = [
+        pulls(one, w, -one.residual * np.sqrt(w / one.variance), found.followed)
+        for one, w in zip(rows, weight, strict=True)
+    ]
+    assert np.allclose(np.concatenate(each).sum(axis=0), gradient, rtol=1e-7, atol=1e-7)
+
+
+def test_noise_of_readings_is_counted_for_its_own_triad_and_not_where_jumps_are_the_starts_errors() -> None:
+    rng = np.random.default_rng(5)
+    n = 40
+    q = normalise(rng.normal(size=(n + 1, 4)))
+    jump = rng.normal(size=(n, 6)) * [0.5, 0.6, 3.0, 0.4, 0.7, 0.8]
+    axes = body_from_inertial(q[:n])
+    turned = np.concatenate(
+        [np.einsum("nji,nj->ni", axes, jump[:, part]) for part in (slice(0, 3), slice(3, 6))], axis=1
+    )
+    variance = np.ones((n, 6))
+    nothing = np.zeros((n, 6, STATES))
+    links = Rows(turned, nothing, nothing, np.zeros((n, 6, 14)), np.arange(n), variance, (TURN,) * 3 + (PUSH,) * 3)
+    values = {
+        "gyroscope": np.array([0.9, 1.0, 1.1, 0.0, 0.0, 0.0]),
+        "accelerometer": np.array([1.2, 1.0, 0.8, 0, 0, 0]),
+    }
+    state = State(q, np.zeros((n + 1, 3)), values)
+    layout = {"gyroscope": slice(1, 7), "accelerometer": slice(8, 14)}
+    found = noise_in_readings(links, state, layout, 0.25, 0.5)
+    expected = np.zeros(14)
+    squares = np.sum(jump**2, axis=0)
+    expected[1:4] = 0.25 * squares[:3] / values["gyroscope"][:3]
+    expected[3] = 0.0  # larger than its noise
+    expected[8:11] = 0.5 * squares[3:] / values["accelerometer"][:3]
+    assert squares[2] > n
+    assert np.all(squares[[0, 1, 3, 4, 5]] < n)
+    assert np.allclose(found, expected, rtol=1e-12)
