@@ -970,6 +970,12 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "estimation.ellipsoid",
         "_gauss_newton",
         "if not np.isfinite(size) or diagonal.max() > 1e6 or diagonal.min() < 1e-9:",
+        "< → <=",
+    ): _NEVER_MET,
+    (
+        "estimation.ellipsoid",
+        "_gauss_newton",
+        "if not np.isfinite(size) or diagonal.max() > 1e6 or diagonal.min() < 1e-9:",
         "1000000.0 → 1100000.0",
     ): "a fit that runs away passes any such limit",
     (

@@ -243,5 +243,5 @@ def _old(units: pl.DataFrame, ages: pl.DataFrame, alerts: Alerts, now: datetime)
 def _idle(ages: pl.DataFrame, alerts: Alerts, now: datetime) -> Iterator[Reason]:
     last = None if ages.is_empty() else ages["last_at"].max()
     if isinstance(last, datetime) and last < now - timedelta(days=alerts.idle_days):
-        told = f"no usable flight for {(now - last).days} days, since {last:%Y-%m-%d}."
+        told = f"No usable flight for {(now - last).days} days, since {last:%Y-%m-%d}."
         yield Reason(IDLE, told, mark=f"{last:%Y-%m-%d}")

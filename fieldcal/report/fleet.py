@@ -14,13 +14,14 @@ from fieldcal.report.history import UsableFlight, as_of_sentence, newest, usable
 from fieldcal.report.key_parameter import key_parameters
 from fieldcal.report.links import Links, flight_name, vehicle_name
 from fieldcal.report.page import Column, Notice, Page, Part, Section, Table, Text, badge
-from fieldcal.report.trend import change_sentence, worst_status
-from fieldcal.report.words import age, day, plain_name, with_unit
+from fieldcal.report.trend import TREND_VALUES, change_sentence, worst_status
+from fieldcal.report.words import age, day, measured, plain_name
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.rows import DriftRow, FitRow, FlightRow
 from fieldcal.trends.reasons import status_words
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.questions import existing, units_flown
+from fieldcal.words.measures import rows_written
 from fieldcal.words.numbers import number
 from fieldcal.words.rows import typed
 
@@ -53,7 +54,7 @@ def fleet_page(root: Path, links: Links, as_of: datetime | None) -> Page:
     warehouse = existing(root)
     moment = as_of or newest(warehouse)
     flights = warehouse.scan("flight").collect()
-    drift = warehouse.scan("drift").collect()
+    drift = rows_written(warehouse.scan("drift").collect(), TREND_VALUES)
     usable = usable_flights(warehouse)
     vehicles = sorted(flights["vehicle_id"].unique().to_list())
     last = {row["vehicle_id"]: row for row in typed(usable.iter_rows(named=True), UsableFlight)}
@@ -123,9 +124,7 @@ def _row(
         "none" if last is None else links.to(flight_name(last["flight_id"]), day(last["started_at"])),
         "–" if last is None else age(last["started_at"], as_of),
         str(flights.height),
-        "–"
-        if tic is None
-        else f"{number(tic['tic'], 3)} {_quantity(tic)} ({with_unit(number(tic['rms'], 3), tic['rms_unit'])})",
+        "–" if tic is None else f"{number(tic['tic'], 3)} {_quantity(tic)} ({measured(tic['rms'], tic['rms_unit'])})",
         text,
         drawn,
     ]

@@ -15,13 +15,14 @@ from fieldcal.report.flight_curves import Curves, curves
 from fieldcal.report.flight_data import FlightData
 from fieldcal.report.links import Links, vehicle_name
 from fieldcal.report.page import Column, Folded, Notice, Page, Part, Section, Table, Text, badge
-from fieldcal.report.words import count, day, plain_name, scientific, unit, with_unit
+from fieldcal.report.words import count, day, measured, plain_name, scientific
 from fieldcal.schemas.rows import CalibrationRow, FitRow, UnfoldedFlight, UnfoldedRun
 from fieldcal.stages.beside.warm_up import METHOD as WARM_UP
 from fieldcal.stages.composition import ORIGIN
 from fieldcal.stages.tables import AXES
 from fieldcal.words.flights import QUANTITIES, advised, decision_sentence, is_consequence, sync_sentence
-from fieldcal.words.numbers import cell, number
+from fieldcal.words.measures import rows_written
+from fieldcal.words.numbers import cell
 from fieldcal.words.rows import BESIDE, standing, typed
 
 PAPER_TIC = {
@@ -114,7 +115,7 @@ def _constants(calibration: pl.DataFrame) -> list[Part]:
             "z = λ · logged + b, axis by axis in sensor axes as logged, polarity in λ's sign; ± one standard deviation."
         )
     ]
-    rows = typed(calibration.iter_rows(named=True), CalibrationRow)
+    rows = typed(rows_written(calibration, ("value", "sd")).iter_rows(named=True), CalibrationRow)
     for sensor, name, letter in PAPER_TABLES:
         own = [row for row in rows if row["sensor"] == sensor and row["method"] != WARM_UP]
         printed = [row for row in own if row["parameter"] in PRINTED]
@@ -132,8 +133,7 @@ def _constants(calibration: pl.DataFrame) -> list[Part]:
     if found:
         columns = (Column("sensor"), Column("what"), Column("axis"), Column("value ± sd", "n"), Column("unit"))
         lines = [
-            [r["sensor"], BESIDE[r["parameter"]], r["axis"], scientific(r["value"], r["sd"]), unit(r["unit"])]
-            for r in found
+            [r["sensor"], BESIDE[r["parameter"]], r["axis"], scientific(r["value"], r["sd"]), r["unit"]] for r in found
         ]
         parts.append(Table("Found beside scale and zero", columns, lines))
     if warm:
@@ -161,7 +161,7 @@ def _paper_table(rows: Sequence[CalibrationRow], caption: str, letter: str) -> T
         state = "; ".join(refused) or badge("ok")
         symbol = f"{SYMBOLS.get(parameter, parameter)} {letter}{axis}"
         values = ["–" if r is None else scientific(r["value"], r["sd"]) for r in own]
-        lines.append([symbol, *values, unit(known["unit"]), state])
+        lines.append([symbol, *values, known["unit"], state])
     columns = [
         Column("parameter"),
         *(Column(m.replace("_", " "), "n") for m in methods),
@@ -174,7 +174,7 @@ def _paper_table(rows: Sequence[CalibrationRow], caption: str, letter: str) -> T
 
 def _further(calibration: pl.DataFrame) -> list[Part]:
     """The constants that count of each unit beside the primary ones."""
-    rows = typed(calibration.iter_rows(named=True), CalibrationRow)
+    rows = typed(rows_written(calibration, ("value", "sd")).iter_rows(named=True), CalibrationRow)
     by_place: dict[tuple[str, str, str], dict[str, CalibrationRow]] = {}
     for row in rows:
         if row["parameter"] in ("scale", "zero") and row["axis"] in AXES and row["method"] != WARM_UP:
@@ -188,7 +188,7 @@ def _further(calibration: pl.DataFrame) -> list[Part]:
             unit_id,
             f"{sensor} {parameter}",
             *(_told(own[axis]) if axis in own else "–" for axis in AXES),
-            unit(next(iter(own.values()))["unit"]),
+            next(iter(own.values()))["unit"],
         ]
         for (unit_id, sensor, parameter), own in by_place.items()
     ]
@@ -241,7 +241,7 @@ def _agreement(data: FlightData) -> list[Part]:
 def _fit_cells(row: FitRow | None) -> tuple[str, str]:
     if row is None or row["tic"] is None:
         return "–", "–"
-    return (f"{row['tic']:.4f}", with_unit(number(row["rms"], 3), row["rms_unit"]))
+    return (f"{row['tic']:.4f}", measured(row["rms"], row["rms_unit"]))
 
 
 def _sync(data: FlightData) -> list[Part]:
@@ -329,7 +329,7 @@ def _coefficients(fit: Sequence[FitRow], quantity: str) -> str:
         return ""
     each = [
         f"{plain_name(r['method'])} against {plain_name(r['reference'])} {r['tic']:.4f}"
-        f" ({with_unit(number(r['rms'], 3), r['rms_unit'])} rms)"
+        f" ({measured(r['rms'], r['rms_unit'])} rms)"
         for r in own
     ]
     return f"TIC (smoothed): {'; '.join(each)}."

@@ -8,10 +8,11 @@ import polars as pl
 
 from fieldcal.names import GRAVEST_FIRST, INERTIAL_FIRST, DriftStatus, Status
 from fieldcal.report.plot import sparkline
-from fieldcal.report.words import PARAMETERS, count, preferred, scientific, unit, with_unit
+from fieldcal.report.words import PARAMETERS, count, preferred, scientific
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.rows import DriftRow
 from fieldcal.warehouse import Warehouse
+from fieldcal.words.measures import rows_written, with_unit
 from fieldcal.words.rows import typed
 
 POINTS = 60
@@ -32,7 +33,8 @@ def key_parameters(
         .sort(FLOWN_ORDER, nulls_last=False)
         .collect()
     )
-    present = rows.join(flown, on=["vehicle_id", "unit_id", "sensor"], how="semi", maintain_order="left")
+    place = ["vehicle_id", "unit_id", "sensor"]
+    present = rows_written(rows, ("value",)).join(flown, on=place, how="semi", maintain_order="left")
     by_vehicle = present.partition_by("vehicle_id", as_dict=True)
     return {str(vehicle): _drawn(own, trends.get(str(vehicle))) for (vehicle,), own in by_vehicle.items()}
 
@@ -46,7 +48,7 @@ def _drawn(own: pl.DataFrame, drift: pl.DataFrame | None) -> tuple[str, str]:
     step = None if unsteady is None else unsteady["change_at"]
     after = [i for i, at in enumerate(shown["started_at"]) if step is not None and at is not None and at >= step]
     name, own_unit = f"{place[0]} {place[2]} {place[3]}", shown["unit"][-1]
-    span = f"{scientific(values[0])} to {scientific(values[-1])} {unit(own_unit)}".strip()
+    span = f"{scientific(values[0])} to {scientific(values[-1])} {own_unit}".strip()
     label = f"{name} over {count(len(values), 'flight')}: {span}"
     marked = after[0] if after and after[0] else None
     return f"{name}: {with_unit(scientific(values[-1]), own_unit)}", sparkline(values, marked, label)

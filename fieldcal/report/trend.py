@@ -11,17 +11,22 @@ import polars as pl
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import GRAVEST_FIRST, DriftStatus
 from fieldcal.report.history import LatestCalibration
-from fieldcal.report.words import count, day, scientific, with_unit
+from fieldcal.report.words import count, day, scientific
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.schemas.rows import DriftRow
+from fieldcal.words.measures import with_unit, written
 
-"""Worst first; `insufficient` says nothing, so a vehicle has it only where nothing else is known."""
-
+TREND_VALUES = (
+    *("value_at_25degc", "sd", "slope_per_degc", "slope_per_degc_sd", "slope_per_day", "slope_per_day_sd"),
+    *("session_sd", "change_size", "change_size_sd"),
+    *("curve_per_degc2", "curve_per_degc2_sd", "curve_per_degc3", "curve_per_degc3_sd"),
+)
+"""Columns of `drift` that go with its unit."""
 DAY_S = 86400.0
 
 
 def worst_status(drift: pl.DataFrame | None) -> str | None:
-    """Worst status of the rows; None where there are none."""
+    """Worst status of the rows; None where there are none. `insufficient` says nothing: only where nothing else is."""
     if drift is None or drift.is_empty():
         return None
     there = set(drift["status"].to_list())
@@ -29,17 +34,24 @@ def worst_status(drift: pl.DataFrame | None) -> str | None:
 
 
 def change_sentence(row: DriftRow, siblings: Sequence[float]) -> str:
-    """What is not steady about a drift row: its own sentence, and what the siblings show of an outlier."""
+    """What is not steady about a drift row: its own sentence, and what the siblings, in the row's unit, show of an
+    outlier."""
     told = str(row["reason"] or "")
     if row["status"] == DriftStatus.OUTLIER and siblings:
-        median = with_unit(scientific(float(np.median(siblings))), row["unit"])
+        median = with_unit(*_written(float(np.median(siblings)), None, row["unit"]))
         told = f"{told} Median of {count(len(siblings), 'sibling')} at {REFERENCE_DEGC:g} °C: {median}.".strip()
     if told:
         return told
     if row["change_at"] is not None:
         return f"Step at the flight of {day(row['change_at'])}."
-    slope = scientific(row["slope_per_day"], row["slope_per_day_sd"])
-    return "–" if slope == "–" else f"{with_unit(slope, row['unit'])} per day."
+    slope, unit = _written(row["slope_per_day"], row["slope_per_day_sd"], row["unit"])
+    return "–" if slope == "–" else f"{with_unit(slope, unit)} per day."
+
+
+def _written(value: float | None, sd: float | None, unit: str) -> tuple[str, str]:
+    factor, name = written(unit)
+    scaled = (None if one is None else one * factor for one in (value, sd))
+    return scientific(*scaled), name
 
 
 def warmed(row: DriftRow, degc: Array | float) -> Array:

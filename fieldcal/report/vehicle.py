@@ -25,9 +25,9 @@ from fieldcal.report.history import (
 )
 from fieldcal.report.links import Links, flight_name
 from fieldcal.report.page import Column, Folded, Heading, Notice, Page, Part, Plot, Section, Simple, Table, Text, badge
-from fieldcal.report.trend import change_sentence, fly_with_sentence, worst_status
+from fieldcal.report.trend import TREND_VALUES, change_sentence, fly_with_sentence, worst_status
 from fieldcal.report.vehicle_figures import MOST_POINTS, agreement_plot, lag_plot, parameter_plot
-from fieldcal.report.words import PARAMETERS, age, count, day, plain_name, preferred, scientific, unit
+from fieldcal.report.words import PARAMETERS, age, count, day, plain_name, preferred, scientific
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.schemas.rows import DecisionRow, DriftRow, UnfoldedFlight
@@ -38,6 +38,7 @@ from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.decisions.withdrawn import decisions
 from fieldcal.warehouse.questions import existing, known_vehicle, units_flown
 from fieldcal.words.flights import decision_sentence
+from fieldcal.words.measures import rows_written
 from fieldcal.words.numbers import number
 from fieldcal.words.rows import typed, unfolded
 
@@ -76,7 +77,7 @@ def vehicle_page(
     imus = list(dict.fromkeys(reversed(flights["imu_id"].to_list())))
     flown = units_flown(warehouse, vehicle_id)
     units = _units(warehouse, vehicle_id, flown)
-    drift = warehouse.scan("drift").filter(pl.col("unit_id").is_in(units)).collect()
+    drift = rows_written(warehouse.scan("drift").filter(pl.col("unit_id").is_in(units)).collect(), TREND_VALUES)
     current = drift.filter(pl.col("unit_id").is_in(flown["unit_id"].to_list()))
     usable = usable_flights(warehouse, vehicle_id)
     status = worst_status(current)
@@ -119,6 +120,7 @@ def _units(warehouse: Warehouse, vehicle_id: str, flown: pl.DataFrame) -> list[s
 
 def _fly_with(warehouse: Warehouse, flown: pl.DataFrame) -> list[Part]:
     rows = warehouse.sql("SELECT * FROM latest_calibration").join(flown, on=["unit_id", "sensor"], how="semi")
+    rows = rows_written(rows, ("value_at_25degc", "sd"))
     if rows.is_empty():
         return [Notice("No flight gave a constant: there is nothing to fly with.")]
     caption = f"Latest constants at {REFERENCE_DEGC:g} °C, ± one standard deviation (view latest_calibration)"
@@ -146,7 +148,7 @@ def _constants_table(caption: str, rows: pl.DataFrame) -> Table:
         values = [scientific(own[a]["value_at_25degc"], own[a]["sd"]) if a in own else "–" for a in axes]
         any_axis = next(iter(own.values()))
         methods = sorted({plain_name(r["method"]) for r in own.values()})
-        lines.append([f"{sensor} {parameter}", *values, unit(any_axis["unit"]), ", ".join(methods), _sources(own)])
+        lines.append([f"{sensor} {parameter}", *values, any_axis["unit"], ", ".join(methods), _sources(own)])
     columns = [
         Column("parameter"),
         *(Column(axis or "–", "n") for axis in axes),
@@ -255,7 +257,7 @@ def _trend_table(caption: str, rows: Sequence[DriftRow]) -> Table:
             scientific(r["value_at_25degc"], r["sd"]),
             scientific(r["slope_per_degc"], r["slope_per_degc_sd"]),
             scientific(r["slope_per_day"], r["slope_per_day_sd"]),
-            unit(r["unit"]),
+            r["unit"],
             number(r["last_z"], 2),
             "–" if r["change_at"] is None else day(r["change_at"]),
         ]
@@ -274,6 +276,7 @@ def _parameters(
         .sort(FLOWN_ORDER, nulls_last=False)
         .collect()
     )
+    rows = rows_written(rows, ("value", "sd"))
     panels = max(3 * len(units), 1, rows.select("unit_id", "axis").unique().height)
     most = max(FEWEST_POINTS, 3 * MOST_POINTS // panels)
     sections: list[Section] = []

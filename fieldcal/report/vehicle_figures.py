@@ -15,7 +15,7 @@ from fieldcal.names import Status
 from fieldcal.report.page import Plot
 from fieldcal.report.plot import INK, XYZ, Across, headed, legend_below, panels, svg
 from fieldcal.report.trend import days_after, predicted, warmed
-from fieldcal.report.words import count, day, unit
+from fieldcal.report.words import count, day
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.schemas.rows import DriftRow
@@ -60,7 +60,7 @@ def parameter_plot(
     for row, axis_name in zip(axes, names, strict=True):
         own = rows.filter(pl.col("axis") == axis_name).tail(most)
         told |= _panel_row(row, own, drift.get(axis_name), vehicle_id)
-        own_unit = unit(own["unit"][0])
+        own_unit = own["unit"][0]
         row[0].set_ylabel(f"{axis_name} ({own_unit})" if own_unit else axis_name, parse_math=False)
     headed(axes[0][0], f"{name} against time")
     if warm:

@@ -5,30 +5,29 @@ from __future__ import annotations
 from datetime import UTC, datetime
 
 from fieldcal.names import exactness
+from fieldcal.words.measures import with_unit, written
 from fieldcal.words.numbers import number, with_sd
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 PARAMETERS = ("scale", "zero_bias", "bias", "zero")
 
-UNITS = {"degC": "°C", "deg": "°", "1": ""}
+
+def logged_unit(text: str | None) -> str:
+    """A unit of readings as they are logged."""
+    return (text or "").replace("^2", "²")
 
 
-def unit(text: str | None) -> str:
-    """A unit as people write it."""
-    return UNITS.get(text or "", (text or "").replace("^2", "²"))
-
-
-def with_unit(text: str, of: str | None) -> str:
-    """A number's text with its unit."""
-    own = unit(of)
-    return text if text == "–" or not own else f"{text} {own}" if own != "°" else f"{text}°"
+def measured(value: float | None, of: str | None) -> str:
+    """A number of a unit of the tables to three digits, as people write it."""
+    factor, name = written(of)
+    return with_unit("–" if value is None else number(value * factor, 3), name)
 
 
 def scientific(value: float | None, sd: float | None = None) -> str:
     """A number with its standard deviation at one power of ten, as the paper's tables have it."""
     if value is None:
         return "–"
-    if 1e-2 <= abs(value) < 1e4 or value == 0.0:
+    if 1e-3 <= abs(value) < 1e6 or value == 0.0:
         return (with_sd(value, sd) if sd else number(value)).replace("-", "−")
     power = int(f"{value:e}".split("e")[1])
     scaled = with_sd(value / 10.0**power, None if sd is None else sd / 10.0**power)

@@ -14,12 +14,13 @@ from fieldcal.report.history import UsableFlight, newest, usable_flights
 from fieldcal.report.key_parameter import key_parameters
 from fieldcal.report.links import Links, flight_name, vehicle_name
 from fieldcal.report.page import STATUS_KIND, Column, Notice, Page, Part, Plot, Section, Table, Text, badge, link
-from fieldcal.report.words import count, day, scientific, unit
+from fieldcal.report.words import count, day, scientific
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.rows import CalibrationRow, FlightRow
 from fieldcal.site.script_data import shown
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.questions import units_flown
+from fieldcal.words.measures import rows_written
 from fieldcal.words.rows import typed
 
 SHOWN_REASONS = 2
@@ -153,7 +154,7 @@ def fleet_data(warehouse: Warehouse, fitness: Mapping[str, Fitness]) -> Json:
 def constants_data(rows: pl.DataFrame, value: str) -> list[Json]:
     """Constants for comparing, in words and numbers, of several methods the most exact. `value`: its column in `rows`,
     beside sensor, method, parameter, axis, unit and sd."""
-    named = rows.with_columns(value=pl.col(value))
+    named = rows_written(rows.with_columns(value=pl.col(value)), ("value", "sd"))
     if "status" in named.columns:
         named = named.filter(pl.col("status") == Status.OK)
     exact = named.with_columns(rank=pl.col("method").map_elements(exactness, return_dtype=pl.Int64))
@@ -164,7 +165,7 @@ def constants_data(rows: pl.DataFrame, value: str) -> list[Json]:
         {
             "place": f"{row['sensor']} {shown(row['parameter'])} {shown(row['axis'])}",
             "method": row["method"],
-            "unit": shown(unit(row["unit"])),
+            "unit": shown(row["unit"]),
             "value": row["value"],
             "sd": row["sd"],
             "text": scientific(row["value"], row["sd"]),

@@ -13,7 +13,7 @@ from fieldcal.names import INERTIAL_FIRST, Sensor
 from fieldcal.report.flight_curves import counting, finite
 from fieldcal.report.flight_data import FlightData
 from fieldcal.report.page import Notice, Part, Plot, Section, Text
-from fieldcal.report.words import unit
+from fieldcal.report.words import logged_unit
 from fieldcal.site.charts import Chart, Charts, Curve, Panel, View
 from fieldcal.stages.tables import AXES, QUATERNION, constants, matrix, seconds, triad
 
@@ -53,7 +53,7 @@ def _readings(data: FlightData, sensor: Sensor, origin: int, charts: Charts) -> 
     if table is None or logged is None or not np.isfinite(logged).any():
         return Text(f"The log has no readings of the {sensor}.")
     t = seconds(table["t_ns"], origin)
-    views = [_view("as logged", t, logged, unit(data.units.get(sensor)))]
+    views = [_view("as logged", t, logged, logged_unit(data.units.get(sensor)))]
     own = _calibration(data, sensor)
     if own is not None:
         views.insert(0, _view("calibrated", t, sensor_model.calibrate(logged, *own[0]), own[1]))
@@ -71,7 +71,7 @@ def _calibration(data: FlightData, sensor: Sensor) -> tuple[tuple[Array, Array],
         return None
     own = constants(rows, sensor, refused_too=True)
     bias = rows.filter(pl.col("parameter") == "bias")
-    return None if own is None or not finite(own) else (own, unit(bias["unit"][0]))
+    return None if own is None or not finite(own) else (own, logged_unit(bias["unit"][0]))
 
 
 def _view(name: str, t: Array, values: Array, own_unit: str) -> View:

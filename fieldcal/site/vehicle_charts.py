@@ -14,7 +14,7 @@ from fieldcal.report.page import Plot
 from fieldcal.report.trend import days_after, predicted, warmed
 from fieldcal.report.vehicle import Drawing
 from fieldcal.report.vehicle_figures import COMPARED, SIGMAS, TOLD
-from fieldcal.report.words import count, unit
+from fieldcal.report.words import count
 from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import REFERENCE_DEGC
 from fieldcal.schemas.rows import DriftRow
@@ -99,7 +99,7 @@ def _panels(
     if (~used & np.isfinite(value)).any():
         told.add("refused")
     ids = rows["flight_id"].to_numpy()
-    own_unit = unit(rows["unit"][0])
+    own_unit = str(rows["unit"][0])
     in_time, in_warmth = _points(masks, x, at_25, sd, ids), _points(masks, degc, at_last, sd, ids)
     if trend is not None and dated:
         first = float(np.nanmin(days)) if changed is None else float(days_after([changed], reference)[0])

@@ -6,8 +6,10 @@ of what a scale does in ppm."""
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
+import polars as pl
 
 from fieldcal.config.flight_settings import STANDARD_GRAVITY_MPS2
 from fieldcal.words.numbers import with_sd
@@ -53,6 +55,22 @@ def written(unit: str | None) -> tuple[float, str]:
         own, own_name = BELOW.get(one, (1.0, one))
         factor, name = factor * own, f"{name}/{own_name}" if name else f"1/{own_name}"
     return factor, name
+
+
+def rows_written(rows: pl.DataFrame, columns: Sequence[str]) -> pl.DataFrame:
+    """Rows whose `columns` are in their column `unit`, in the units that people write.
+
+    Examples
+    --------
+    >>> rows_written(pl.DataFrame({"value": [0.5, None], "unit": ["rad/s", "m/s^2"]}), ["value"]).rows()
+    [(28.64788975654116, '°/s'), (None, 'mg')]
+    """
+    if rows.is_empty():
+        return rows
+    known = {one: written(one) for one in rows["unit"].unique()}
+    factor = pl.col("unit").replace_strict({one: own[0] for one, own in known.items()}, return_dtype=pl.Float64)
+    name = pl.col("unit").replace_strict({one: own[1] for one, own in known.items()}, return_dtype=pl.String)
+    return rows.with_columns(*(pl.col(column) * factor for column in columns), unit=name)
 
 
 def measure(value: float | None, sd: float | None, unit: str | None) -> str:

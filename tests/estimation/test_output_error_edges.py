@@ -123,6 +123,15 @@ def test_the_walk_by_hand() -> None:
     assert random_walk(t[:120], falling, np.zeros(120), np.ones(120)) == (0.0, 0.0)
 
 
+def test_a_walk_is_all_of_the_residual_at_most() -> None:
+    """One step half-way: means half a stretch apart differ by 1, one in eleven neighbours too. A walk of that density
+    would have 16/11 of the variance there is."""
+    residual = np.repeat([-0.5, 0.5], 60)[:, None] * np.ones(3)
+    found, share = random_walk(np.arange(120) * 0.5, residual, np.zeros(120), np.ones(120))
+    assert found * 120 * 0.5 / 6.0 / 0.25 == pytest.approx(16.0 / 11.0)
+    assert share == 1.0
+
+
 @pytest.mark.parametrize(("short", "told"), [(6, False), (7, True)])
 def test_a_stretch_needs_more_than_half_the_blocks(short: int, told: bool) -> None:
     """Blocks are twelfths of the typical stretch; of one with six there is no pair half a stretch apart."""

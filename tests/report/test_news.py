@@ -68,7 +68,7 @@ def test_age_is_told_when_it_passes_the_limit(tmp_path: Path) -> None:
 
     assert reasons(43.0) == []
     assert [r.kind for r in reasons(44.5)] == [IDLE]
-    assert reasons(44.5)[0].sentence == f"no usable flight for 30 days, since {LAST:%Y-%m-%d}."
+    assert reasons(44.5)[0].sentence == f"No usable flight for 30 days, since {LAST:%Y-%m-%d}."
     assert [r.kind for r in reasons(104.5)] == [EXPIRED, IDLE]
     assert f"accelerometer, gyroscope last calibrated on {LAST:%Y-%m-%d}" in reasons(104.5)[0].sentence
     assert reasons(104.5)[0].key == reasons(105.5)[0].key

@@ -172,12 +172,12 @@ def test_figures_show_what_the_history_holds(fleet: Path) -> None:
     assert set(curve["of"]) == set(known)
     for flight_id, degc, sd in zip(curve["of"], chart["xs"][curve["x"]], curve["sd"], strict=True):
         assert degc == pytest.approx(known[flight_id]["temperature_degc"], rel=1e-6)
-        assert sd == pytest.approx(known[flight_id]["sd"], rel=1e-6)
+        assert sd == pytest.approx(np.degrees(known[flight_id]["sd"]), rel=1e-6)
     frame = pl.read_parquet(fleet / "site" / "data" / "vehicle-alpha.parquet")
     same = frame.filter(figure="gyroscope zero_bias", view="against temperature", panel="x", curve="flights")
     assert same["flight_id"].to_list() == curve["of"]
     assert np.allclose(same["y"].to_numpy(), curve["y"], rtol=1e-6)
-    assert same["unit"].unique().to_list() == ["rad/s"]
+    assert same["unit"].unique().to_list() == ["°/s"]
 
 
 def test_every_format_is_there_or_says_why_not(fleet: Path) -> None:

@@ -15,7 +15,7 @@ from fieldcal.report.flight_curves import Curves, counting, covered_cells, lengt
 from fieldcal.report.flight_data import FigureSettings
 from fieldcal.report.page import Plot
 from fieldcal.report.plot import INK, XYZ, backdrop, curve, headed, legend, panels, solid_panels, svg, without_wraps
-from fieldcal.report.words import plain_name, unit
+from fieldcal.report.words import logged_unit, plain_name
 from fieldcal.stages.tables import QUATERNION, matrix, seconds, triad
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def unprocessed(tables: Mapping[str, pl.DataFrame], units: Mapping[str, str]) ->
         t, values = seconds(frame["t_ns"], origin), matrix(frame, triad(name))
         for i, colour in enumerate(XYZ):
             curve(axis, t, values[:, i], colour, label="xyz"[i], width=0.8)
-        headed(axis, f"{name} ({unit(units.get(name)) or 'as logged'})")
+        headed(axis, f"{name} ({logged_unit(units.get(name)) or 'as logged'})")
         legend(axis)
     orientation = ""
     if len(shown) > len(signals):
@@ -94,7 +94,7 @@ def _origin(tables: Mapping[str, pl.DataFrame]) -> int:
 def spheres(samples: pl.DataFrame, calibration: pl.DataFrame, settings: FigureSettings) -> list[Plot]:
     """Figure 6: calibrated readings on their spheres; and how much of each sphere they cover."""
     radii = {
-        Sensor.MAGNETOMETER: (float(np.linalg.norm(settings.field_ned)), unit(settings.field_unit)),
+        Sensor.MAGNETOMETER: (float(np.linalg.norm(settings.field_ned)), logged_unit(settings.field_unit)),
         Sensor.ACCELEROMETER: (settings.gravity_mps2, "m/s²"),
     }
     found = {name: vectors for name in radii if (vectors := lengths(samples, calibration, name)) is not None}
