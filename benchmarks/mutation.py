@@ -52,7 +52,7 @@ from types import CodeType, FrameType, FunctionType
 from typing import Any
 
 import pytest
-from mutation_table import EQUIVALENT, TESTS
+from mutation_table import EQUIVALENT, FOR_C, TESTS
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGE = REPOSITORY / "fieldcal"
@@ -392,6 +392,7 @@ def tests_through(change: Change, baseline: Baseline, patience_s: float) -> list
 def survivors(module: str, changes: Sequence[Change], patience_s: float) -> list[Change]:
     """The changes of a module that no test notices. Raises SystemExit when a test fails without any change."""
     files = [str(path) for path in tests_of(module)]
+    os.environ["FIELDCAL_KERNEL"] = "" if module in FOR_C else "numpy"
     with tempfile.NamedTemporaryFile() as result:
 
         def watched(session: pytest.Session) -> None:
@@ -464,7 +465,6 @@ def main() -> None:
     parser.add_argument("--patience", type=float, default=20.0, help="tests that take longer are left out, s (20)")
     arguments = parser.parse_args()
 
-    os.environ["FIELDCAL_KERNEL"] = "numpy"  # its code is what is changed; the kernel in C would run instead of it
     prepare()
     left_out = set(modules_of(arguments.without)) if arguments.without else set()
     names = [name for name in modules_of(arguments.module) if name not in left_out]

@@ -50,6 +50,7 @@ TESTS: dict[str, Sequence[str]] = {
     "estimation.gyroscope.output_error": ("estimation/test_output_error*.py",),
     "estimation.gyroscope.regressor_noise": ("estimation/test_regressor_noise*.py",),
     "estimation.joint": ("estimation/joint/test_*.py",),
+    "estimation.joint.kernel": ("compiled/test_joint_kernel.py",),
     "estimation.motion_selection": ("estimation/test_motion_selection*.py",),
     "estimation.motor_field": ("estimation/test_motor_field*.py",),
     "estimation.pooled": ("estimation/pooled/test_*.py",),
@@ -65,6 +66,10 @@ TESTS: dict[str, Sequence[str]] = {
 }
 """Module, or room of modules, below fieldcal → its own tests below tests/. The longest name counts; a module of the
 four rooms that has no line of its own is held to all tests of its room."""
+
+FOR_C = frozenset({"estimation.joint.kernel"})
+"""Modules that lay out what the kernel in C reads: it runs in their tests. In all others the NumPy code does, for it is
+what is changed."""
 
 _AT_A_TIME = "how much is worked on at a time; the result is the same"
 _ROOM = "room that is filled up to `filled`, which is what is returned"
@@ -2244,6 +2249,12 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         'f"{path}, line {number}: {line.strip()[:60]!r} is no parameter as QGroundControl or Mission Planner"',
         "60 → 66",
     ): "how much of a line is shown, to find it by",
+    (
+        "estimation.joint.ladder",
+        "magnetometer_start",
+        "columns = np.concatenate([turn, -np.broadcast_to(np.eye(3), turn.shape)], axis=2).reshape(-1, 6)",
+        "1 → 2",
+    ): _ANY_NEGATIVE,
     (
         "estimation.joint.ladder",
         "magnetometer_start",
