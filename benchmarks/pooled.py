@@ -175,7 +175,7 @@ def flights(vehicles: int, count: int, jobs: int) -> None:
         ok = alone.filter(status="ok")
         z = [_z(row, truths, last=False) for row in ok.iter_rows(named=True)]
         pooled = table.filter(sensor=sensor, parameter=parameter)
-        told = pooled.filter(pl.col("status").is_in(["ok", "step"]))
+        told = pooled.filter(pl.col("status").is_in(["ok", "step", "drifting"]))
         pooled_z = [_z(row, truths, last=True) for row in told.iter_rows(named=True)]
         print(
             f"| {sensor} {parameter} | {ok.height} of {alone.height} | {_rms(z):.2f} | {told.height} of {3 * vehicles} "
@@ -345,7 +345,7 @@ def real(archives: Sequence[Path], piece_s: float) -> None:
                     continue
                 for j, parameter in enumerate(("scale", "zero")):
                     told = table.filter(sensor=str(sensor), parameter=parameter).filter(
-                        pl.col("status").is_in(["ok", "step"])
+                        pl.col("status").is_in(["ok", "step", "drifting"])
                     )
                     for row in told.iter_rows(named=True):
                         i = "xyz".index(row["axis"])

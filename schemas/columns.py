@@ -350,7 +350,7 @@ STATUS = Column(
     _TEXT,
     "",
     "outcome: ok, refused, absent, failed, or withdrawn by a decision (`drift`: stable, drifting, step, outlier, "
-    "insufficient; `pooled`: ok, step, refused, or insufficient where the last session contradicts the others)",
+    "insufficient; `pooled`: ok, step, drifting, refused, or insufficient where the last session contradicts the others)",
 )
 
 # --- run

@@ -9,6 +9,7 @@ not averaged with it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -86,8 +87,13 @@ def of_present_sensor(flights: pl.DataFrame) -> tuple[pl.DataFrame, dict[tuple[s
     return flights, exchanged
 
 
-def told(table: pl.DataFrame, exchanged: dict[tuple[str, str], Exchange]) -> pl.DataFrame:
-    """The table `drift` with what was exchanged: a unit of which one sensor flew after another has stepped."""
+def told(
+    table: pl.DataFrame,
+    exchanged: dict[tuple[str, str], Exchange],
+    steady: Sequence[str] = (DriftStatus.STABLE, DriftStatus.INSUFFICIENT),
+) -> pl.DataFrame:
+    """The table `drift` or `pooled` with what was exchanged: a unit of which one sensor flew after another has stepped,
+    where its status was one of `steady`."""
     if not exchanged:
         return table
     rows = [
@@ -100,7 +106,7 @@ def told(table: pl.DataFrame, exchanged: dict[tuple[str, str], Exchange]) -> pl.
     both = table.join(pl.DataFrame(rows, schema=schema), on=["unit_id", "sensor"], how="left", maintain_order="left")
     other = pl.col("exchange").is_not_null()
     return both.with_columns(
-        status=pl.when(other & pl.col("status").is_in([DriftStatus.STABLE, DriftStatus.INSUFFICIENT]))
+        status=pl.when(other & pl.col("status").is_in([str(status) for status in steady]))
         .then(pl.lit(str(DriftStatus.STEP)))
         .otherwise("status"),
         change_at=pl.when(other).then(pl.coalesce("change_at", "since")).otherwise("change_at"),

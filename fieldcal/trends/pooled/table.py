@@ -13,13 +13,14 @@ import polars as pl
 
 from fieldcal.estimation.pooled.unit import Kinds, Pooled, Unit, pool, strengths
 from fieldcal.flight.threads import one_thread
+from fieldcal.names import Status
 from fieldcal.provenance.run_key import run_key, source_digest
 from fieldcal.schemas import TABLES, table_key
+from fieldcal.trends.one_sensor import told
 from fieldcal.trends.pooled.memory import Memory
+from fieldcal.trends.pooled.present import information_that_counts
 from fieldcal.trends.pooled.rows import rows_of_unit, strengths_told
 from fieldcal.trends.pooled.units import DAY, EPOCH, HistoryUnit, by_unit, sessions_flown, unit_of
-from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.decisions.withdrawn import counting
 from fieldcal.warehouse.layout import history_files
 from fieldcal.warehouse.publish import publish
 from fieldcal.warehouse.store import empty_frame, read_table
@@ -54,12 +55,8 @@ def update_pooled(root: Path) -> tuple[str, ...]:
 
 def pooled_table(root: Path, memory: Memory | None = None) -> pl.DataFrame:
     """The table `pooled` as the history has it now; nothing is written."""
-    return table_of(information_that_counts(root), memory)
-
-
-def information_that_counts(root: Path) -> pl.DataFrame:
-    """Rows of `information` of flights that nobody withdrew."""
-    return Warehouse(root).scan("information").filter(counting(root)).collect()
+    information, exchanged = information_that_counts(root)
+    return told(table_of(information, memory), exchanged, (Status.OK,))
 
 
 def table_of(information: pl.DataFrame, memory: Memory | None = None) -> pl.DataFrame:
@@ -87,7 +84,7 @@ def table_then(root: Path, table: pl.DataFrame, moment: datetime) -> pl.DataFram
 
     Rows of units that no flight of which has a date are left out: nobody knows what they were when."""
     day = ((moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - EPOCH) / DAY
-    information = information_that_counts(root)
+    information, exchanged = information_that_counts(root)
     out = [empty_frame("pooled")]
     for (unit_id,), own in table.group_by("pooled_with", maintain_order=True):
         one = unit_of(by_unit(information.filter(pl.col("unit_id") == unit_id))[0])
@@ -97,7 +94,7 @@ def table_then(root: Path, table: pl.DataFrame, moment: datetime) -> pl.DataFram
         with one_thread():
             rows = pl.DataFrame(rows_of_unit(one, near(one, kinds), kinds, day), schema=out[0].schema)
         out.append(rows.join(own.select(KEY), on=KEY, how="semi"))
-    return pl.concat(out).sort(KEY)
+    return told(pl.concat(out), exchanged, (Status.OK,)).sort(KEY)
 
 
 def kinds_of(units: Sequence[pl.DataFrame]) -> Kinds:
