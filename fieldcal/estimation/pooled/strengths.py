@@ -24,7 +24,8 @@ FEW = 4.0
 EXPECTED_SHARE = 0.5
 RISE = 0.3
 """Of minus twice the logarithm of the likelihood that a strength is still likely at: half a standard deviation."""
-TOLERANCES = {"fatol": 1e-4, "xatol": 1e-3}
+TOLERANCES = {"fatol": 0.01, "xatol": 0.02}
+"""Of minus twice the logarithm of the likelihood and of logarithms of variances: well below `RISE` and `GRID`."""
 GRID = 1.25
 """Ratio of neighbouring variances that are told apart."""
 START = 0.2, 0.4, 0.5
@@ -164,4 +165,4 @@ def _largest_likely(cost: Callable[[Array], float], best: Array, least: float, i
         x[i] = value
         return cost(x) - least - RISE
 
-    return float(brentq(rise, low, high, xtol=1e-3)) if rise(high) > 0.0 else low
+    return float(brentq(rise, low, high, xtol=TOLERANCES["xatol"])) if rise(high) > 0.0 else low
