@@ -245,6 +245,7 @@ class PooledRow(UnitLead):
     flights: list[str]
     shares: list[float]
     left_out: list[str]
+    distances: list[float] | None
     status: str
     reason_code: str | None
     reason: str | None

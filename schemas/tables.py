@@ -355,6 +355,7 @@ _HISTORY = (
             c.FLIGHTS_POOLED,
             c.SHARES,
             c.LEFT_OUT,
+            c.DISTANCES,
             c.STATUS,
             c.REASON_CODE,
             c.REASON,

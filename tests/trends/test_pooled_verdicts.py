@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from fieldcal.names import Sensor
 from fieldcal.report import write_vehicle_report
 from fieldcal.trends.drift_table import update_drift
 from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.publish import publish
 
 VEHICLES, SESSIONS, AT, SPOILED = 6, 10, 6, 4
 STEPPED, DRIFTING = ("gyroscope", "zero", "x"), ("accelerometer", "zero", "y")
@@ -96,7 +98,7 @@ def test_all_ways_to_ask_say_the_same_of_what_moved(
     pooled = of(pl.DataFrame(printed("pooled", "--json"), infer_schema_length=None))
     drift = of(pl.DataFrame(printed("drift", "--json"), infer_schema_length=None))
     latest = of(warehouse.sql("FROM latest_calibration"))
-    pages = {f"v{k}": write_vehicle_report(root, f"v{k}").read_text(encoding="utf-8") for k in range(VEHICLES)}
+    pages = {name: write_vehicle_report(root, name).read_text(encoding="utf-8") for name in ("v0", "v1")}
     flown = {f"v{k}": warehouse.calibration_at(f"v{k}") for k in range(VEHICLES)}
     assert len(pooled) == 18 * VEHICLES
     for key, own in pooled.items():
@@ -138,3 +140,27 @@ def test_an_exchanged_sensor_is_not_pooled_with_the_one_that_flies(fleet: tuple[
         truth = 1.0 / own if row["parameter"] == "scale" else own
         assert abs(row["value_at_25degc"] - truth) < 4.0 * row["sd"]
     assert set(pooled.filter(sensor="accelerometer")["n_flights"]) == {SESSIONS}
+
+
+def test_a_flight_that_was_linearised_too_far_from_the_unit_is_left_out_and_told(
+    fleet: tuple[Path, list[Truth]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its equations as they would be at an accelerometer's scale 30 % away, where they do not hold."""
+    root = Path(shutil.copytree(fleet[0], tmp_path / "copy"))
+    own = Warehouse(root).scan("information", vehicle_id="v4").collect()
+    odd = (pl.col("flight_id") == "004-0003") & (pl.col("sensor") == "accelerometer") & (pl.col("parameter") == "gain")
+    moved_there = own.with_columns(
+        linearised_at=pl.when(odd).then(pl.col("linearised_at") * 1.3).otherwise("linearised_at")
+    )
+    publish(root, "v4", {"information": moved_there}, own["flight_id"].unique().to_list())
+    update_drift(root)
+    rows = Warehouse(root).scan("pooled", vehicle_id="v4").collect()
+    assert (
+        rows["reason"].str.contains("1 left out: made at scales up to 3.. times as far from these as they hold").all()
+    )
+    assert set(rows["n_flights"]) == {SESSIONS - 1}
+    capsys.readouterr()
+    assert run(["pooled", "--vehicle", "v4", "--flights", "--json", "--warehouse", str(root)]) == 0
+    far = {row["flight_id"]: row["distance"] for row in json.loads(capsys.readouterr().out)}
+    assert 2.5 < far.pop("004-0003") < 3.5
+    assert max(far.values()) < 0.3

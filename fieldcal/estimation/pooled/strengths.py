@@ -108,8 +108,8 @@ def strengths_of(series: Series, *, with_slope: bool = True) -> Strengths:
     """The strengths that make the series' innovations likeliest.
 
     Few innovations cannot tell a little from nothing: then the scatter, and what the slope does over the temperatures
-    flown, are taken for half of a session's own sd. Nor can they tell a walk or a slope from scatter: what may be either
-    is scatter. Without any two sessions to compare nothing is known to move, but the scatter is that."""
+    flown, are taken for half of a session's own sd. Nor can they tell a walk or a slope from scatter: what may be
+    either is scatter. Without any two sessions to compare nothing is known to move, but the scatter is that."""
     known = np.isfinite(series.value)
     if not known.any():
         return Strengths(0.0, 0.0, 0.0, FEW)

@@ -111,7 +111,7 @@ def plan(root: Path, vehicle_id: str) -> Plan:
     rows = information.filter(pl.col("unit_id") == now)
     one = unit_of(by_unit(rows)[0])
     with one_thread():
-        found = near(one, strengths_told(table.filter(pl.col("pooled_with") == now), one))
+        found, _ = near(one, strengths_told(table.filter(pl.col("pooled_with") == now), one))
         axes = _axes(warehouse.scan("run", vehicle_id=vehicle_id))
         dip_rad = _dip(warehouse.scan("calibration", vehicle_id=vehicle_id))
         about = [turned for n in (1, 2, 3) for turned in combinations(range(3), n)]

@@ -32,9 +32,10 @@ TILT = "Turn it over, so that the sensor's {axis} axis points up, down and level
 Row = dict[str, object]
 
 
-def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds, day: float | None = None) -> list[Row]:
+def rows_of_unit(one: HistoryUnit, found: Pooled, distance: Array, kinds: Kinds, day: float | None = None) -> list[Row]:
     """Rows of each constant, at the last session unless a `day` since EPOCH is given; of a unit whose flights say
-    nothing none."""
+    nothing none. `distance` (n,): of each flight's reference point from the pooled one, over that up to which its
+    equations hold."""
     if not any(own.information.any() for own in found.raw):
         return []
     now = found.at(day)
@@ -51,6 +52,11 @@ def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds, day: float | Non
         size = abs(factor[place])
         refusal = _refusal(found, now, place, name, degc[place], one)
         status, code, reason = Status.OK.value, None, _sentence(found, place, shares[:, place], left_out)
+        if reason and (far := int(np.sum(distance > 1.0))):
+            reason += (
+                f" {far} left out: made at scales up to {distance.max():.1f} times as far from these as they hold. "
+                "Calibrate their logs again."
+            )
         step = next((s for s in reversed(found.steps) if s.name == name), None)
         if refusal:
             status, code, reason = Status.REFUSED.value, ReasonCode.SCALE_UNCERTAIN.value, refusal
@@ -101,6 +107,7 @@ def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds, day: float | Non
             "flights": list(one.flight_ids),
             "shares": [float(v) for v in shares[:, place]],
             "left_out": left_out,
+            "distances": [float(v) for v in distance],
             "status": status,
             "reason_code": code,
             "reason": reason,
