@@ -3,6 +3,7 @@
     python benchmarks/pooled.py flights [--vehicles 6] [--flights 40] [--jobs 2]    simulated flights through the stages
     python benchmarks/pooled.py flights --motion mission [--without] [--seconds 60]   ordinary ones, by velocity or not
     python benchmarks/pooled.py together [--rounds 5]       pooled parts of a recording against one fit of all of it
+    python benchmarks/pooled.py claims [--fleets 4]         error ÷ sd of units drawn without signals
     python benchmarks/pooled.py alarms [--fleets 100]       units without a fault: how many are told of one
     python benchmarks/pooled.py cost [--units 500] [--flights 200]                  cold, and after one new flight
     python benchmarks/pooled.py real ARCHIVE … [--piece 20]  recordings cut into pieces against their reference
@@ -269,12 +270,18 @@ def together(rounds: int) -> None:
 
 
 def drawn(
-    rng: np.random.Generator, sessions: int, *, seen: int = 9, step: tuple[int, int, float] | None = None
+    rng: np.random.Generator,
+    sessions: int,
+    *,
+    seen: int = 9,
+    step: tuple[int, int, float] | None = None,
+    scatters: float = 3.0,
+    truth: Truth | None = None,
 ) -> Unit:
-    """A unit as flights' information, without signals: each shows `seen` random directions of the 18. `step`: session,
-    constant, and by how many scatters."""
-    truth = Truth(rng, sessions)
-    sd = of_names(SCATTER) * 3.0
+    """A unit as flights' information, without signals: each shows `seen` random directions of the 18, to so many
+    `scatters` of sessions. `step`: session, constant, and by how many scatters."""
+    truth = truth or Truth(rng, sessions)
+    sd = of_names(SCATTER) * scatters
     made = []
     for session in range(sessions):
         degc = float(rng.uniform(5.0, 35.0))
@@ -287,6 +294,31 @@ def drawn(
         equations = NormalEquations(NAMES, nominal, look.T @ (reading - look @ nominal), look.T @ look)
         made.append(Flight(equations, session, degc - 25.0))
     return Unit(tuple(made), truth.day)
+
+
+def claims(fleets: int, units: int = 6) -> None:
+    """Error ÷ sd, rms, by kind, sessions and how well a flight knows the constants."""
+    print("| sessions | directions | sd of one, in scatters | " + " | ".join(" ".join(kind) for kind in SCATTER) + " |")
+    for sessions in (2, 4, 8, 20):
+        for seen, scatters in ((12, 3.0), (30, 3.0), (30, 0.1)):
+            z: dict[tuple[str, str], list[float]] = {kind: [] for kind in SCATTER}
+            for number in range(fleets):
+                rngs = [np.random.default_rng([number, unit, sessions]) for unit in range(units)]
+                truths = [Truth(rng, sessions) for rng in rngs]
+                drawn_units = [
+                    drawn(rng, sessions, seen=seen, scatters=scatters, truth=truth)
+                    for rng, truth in zip(rngs, truths, strict=True)
+                ]
+                kinds = strengths(drawn_units)
+                for unit, truth in zip(drawn_units, truths, strict=True):
+                    found = pool(unit, kinds)
+                    now, sd = found.at(), np.sqrt(np.diagonal(found.at().covariance))
+                    for place, name in enumerate(found.names):
+                        if np.isfinite(sd[place]):
+                            off = now.state[place] - truth.walked[-1][NAMES.index(name)]
+                            z[name[:2]].append(float(off / sd[place]))
+            cells = " | ".join(f"{_rms(values):.2f}" for values in z.values())
+            print(f"| {sessions} | {seen} | {scatters:g} | {cells} |", flush=True)
 
 
 def alarms(fleets: int, units: int = 12, counts: Sequence[int] = (4, 8, 12, 24)) -> dict[int, tuple[int, int, int]]:
@@ -401,7 +433,7 @@ def real(archives: Sequence[Path], piece_s: float) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("flights", "together", "alarms", "cost", "real"))
+    parser.add_argument("what", choices=("flights", "together", "claims", "alarms", "cost", "real"))
     parser.add_argument("archive", nargs="*", type=Path)
     parser.add_argument("--vehicles", type=int, default=6)
     parser.add_argument("--flights", type=int, default=40)
@@ -425,6 +457,8 @@ def main() -> None:
         )
     elif given.what == "together":
         together(given.rounds)
+    elif given.what == "claims":
+        claims(min(given.fleets, 4))
     elif given.what == "alarms":
         alarms(given.fleets)
     elif given.what == "cost":
