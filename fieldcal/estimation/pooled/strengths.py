@@ -33,6 +33,9 @@ START, TIMES = (0.2, 0.4, 0.5), (1.0, 4.0, 16.0, 64.0, 256.0)
 for."""
 
 
+NO_PAIRS = np.zeros((0, 3))
+
+
 @dataclass(frozen=True)
 class Strengths:
     """Of one kind of constant: variance of the `walk` a day, of the `scatter` of sessions, of the `slope` on
@@ -104,8 +107,11 @@ def innovations(series: Series, strengths: Strengths) -> tuple[Array, Array]:
     return z, variance
 
 
-def strengths_of(series: Series, *, with_slope: bool = True) -> Strengths:
+def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_PAIRS) -> Strengths:
     """The strengths that make the series' innovations likeliest.
+
+    `within` (k, 3): of two flights of a session, which share its scatter, by how much temperature and value differ and
+    the variance of that: slopes are told by them too.
 
     Few innovations cannot tell a little from nothing: then the scatter, and what the slope does over the temperatures
     flown, are taken for half of a session's own sd. Nor can they tell a walk or a slope from scatter: what may be
@@ -138,6 +144,8 @@ def strengths_of(series: Series, *, with_slope: bool = True) -> Strengths:
         if with_slope:
             few += _unlikely(strengths.slope / units[2])
             few += 0.5 * FEW * np.log1p(strengths.slope * range_degc**2 / strengths.scatter)
+            variance = strengths.slope * within[:, 0] ** 2 + within[:, 2]
+            few += np.sum(np.minimum(np.log(variance / own) + within[:, 1] ** 2 / variance, RESTART_SD**2))
         outside = np.sum(np.maximum(np.abs(x) - LIMITS[1], 0.0) ** 2)
         return float(likelihood + few + outside)
 

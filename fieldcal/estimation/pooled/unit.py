@@ -384,12 +384,18 @@ def strengths(units: Sequence[Unit], *, rounds: int = 2) -> dict[tuple[str, str]
     kinds = _first_strengths(units)
     for _ in range(rounds):
         rows: dict[tuple[str, str], list[Array]] = {kind: [] for kind in kinds}
+        within: dict[tuple[str, str], list[Array]] = {kind: [] for kind in kinds}
         for unit in units:
             found = pool(unit, kinds, tested=False)
-            for name, series in zip(found.names, _series(found), strict=True):
+            for name, series, pairs in zip(found.names, _series(found), _within_sessions(found), strict=True):
                 rows[name[:2]].append(series)
+                within[name[:2]].append(pairs)
         kinds = {
-            kind: strengths_of(Series.of([one for one in own if len(one)]), with_slope=kind[1] in SLOPED)
+            kind: strengths_of(
+                Series.of([one for one in own if len(one)]),
+                with_slope=kind[1] in SLOPED,
+                within=np.concatenate(within[kind]),
+            )
             for kind, own in rows.items()
         }
     return {kind: strengths.coarse() for kind, strengths in kinds.items()}
@@ -433,3 +439,36 @@ def _series(found: Pooled) -> list[Array]:
                 value = (x / v - (x_others * known if known else 0.0)) / information
                 rows[place].append((float(day), warmth_degc, value, 1.0 / information))
     return [np.array(own).reshape(-1, 4) for own in rows]
+
+
+def _within_sessions(found: Pooled) -> list[Array]:
+    """Of each constant (k, 3): how two flights of a session, one after the other, differ in temperature and value, and
+    the variance of that; the other constants as the other sessions and the one flight know them."""
+    pairs: list[list[tuple[float, float, float]]] = [[] for _ in found.names]
+    last: dict[int, tuple[float, Array, Array]] = {}
+    flown = [flight.session for flight in found.unit.flights]
+    for k, flight in enumerate(found.unit.flights):
+        if flight.warmth_degc is None or flown.count(flight.session) < 2:
+            continue
+        others = found.chain.others(flight.session).loosened(found.scatter)
+        before, together = others.estimate(), (others + found.raw[k]).estimate()
+        value, variance = np.full((2, len(found.names)), np.nan)
+        for place in found.sloped:
+            combination = found.combination(place, flight.warmth_degc)
+            (x, v), (x_others, v_others) = together.of(combination), before.of(combination)
+            known = 1.0 / v_others if np.isfinite(v_others) else 0.0
+            if np.isfinite(v) and 1.0 / v - known > LEAST_SHARE / v:
+                variance[place] = 1.0 / (1.0 / v - known)
+                value[place] = (x / v - (x_others * known if known else 0.0)) * variance[place]
+        if flight.session in last:
+            warmth, other, other_variance = last[flight.session]
+            for at in np.flatnonzero(np.isfinite(value) & np.isfinite(other)):
+                pairs[at].append(
+                    (
+                        flight.warmth_degc - warmth,
+                        float(value[at] - other[at]),
+                        float(variance[at] + other_variance[at]),
+                    )
+                )
+        last[flight.session] = flight.warmth_degc, value, variance
+    return [np.array(own).reshape(-1, 3) for own in pairs]

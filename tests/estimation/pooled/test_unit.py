@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pooled import NAMES, SCATTER, Truth, alarms, drawn, of_names
+from pooled import NAMES, PER_DEGC, SCATTER, Truth, alarms, drawn, of_names
 
 from fieldcal.estimation.normal_equations import NormalEquations
 from fieldcal.estimation.pooled.chain import Known
 from fieldcal.estimation.pooled.strengths import Series, Strengths, innovations, strengths_of
-from fieldcal.estimation.pooled.unit import Flight, Kinds, Unit, contradiction, pool
+from fieldcal.estimation.pooled.unit import Flight, Kinds, Unit, contradiction, pool, strengths
 
 SESSIONS = 12
 KNOWN: Kinds = {
@@ -207,6 +207,29 @@ def test_strengths_are_found_where_sessions_are_known_far_better_than_they_scatt
     found = strengths_of(drawn_series(np.random.default_rng(6), true, own_sd, 18, sessions))
     assert 0.5 < found.scatter < 2.5
     assert found.walk < 0.2, "what may be either is scatter"
+
+
+def test_flights_of_a_session_tell_slopes_that_its_scatter_hides() -> None:
+    """Two a session at other temperatures, known a hundred times better than sessions scatter; none is left out."""
+    units = []
+    for number in range(4):
+        rng = np.random.default_rng([21, number])
+        truth = Truth(rng, 6)
+        flights = []
+        for k in range(12):
+            degc = float(rng.uniform(5.0, 35.0))
+            sd = 0.01 * of_names(SCATTER)
+            reading = truth.of_flight(k // 2, degc) + sd * rng.normal(size=18)
+            information = np.diag(sd**-2)
+            flights.append(
+                Flight(NormalEquations(NAMES, np.zeros(18), information @ reading, information), k // 2, degc - 25.0)
+            )
+        units.append(Unit(tuple(flights), truth.day))
+    kinds = strengths(units)
+    for kind in SCATTER:
+        assert 0.5 < np.sqrt(kinds[kind].slope) / PER_DEGC[kind] < 2.0, kind
+        assert 0.6 < np.sqrt(kinds[kind].scatter) / SCATTER[kind] < 1.6, kind
+    assert not any(found.left_out or found.steps for found in (pool(unit, kinds) for unit in units))
 
 
 def test_innovations_of_the_right_strengths_are_white() -> None:
