@@ -5,6 +5,7 @@ spoiled by a magnet. Every unit has temperature coefficients of its own.
 
     python benchmarks/drift_fleet.py                    many fleets as rows of the history: seconds
     python benchmarks/drift_fleet.py --sessions 8       the same of young fleets: what so few sessions tell
+    python benchmarks/drift_fleet.py --pooled           rows with their information: drift is read from the smoother
     python benchmarks/drift_fleet.py --sessions 18 --tell        when a drift is named, and was said to be
     python benchmarks/drift_fleet.py --logs FOLDER      one fleet as simulated logs through `fieldcal nightly`: minutes
 """
@@ -24,12 +25,15 @@ from typing import Any
 
 import numpy as np
 import polars as pl
+from scipy.linalg import block_diag
 
-from fieldcal.names import SENSORS
+from fieldcal.names import SENSORS, Sensor
 from fieldcal.simulation.archive import write_flight
 from fieldcal.simulation.experiment import BIAS, MID_SCALE, SCALE, Experiment, simulate
 from fieldcal.trends.drift_table import table_of, update_drift
+from fieldcal.trends.pooled.table import table_of as pooled_of
 from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.store import empty_frame
 
 UNITS, SESSIONS = 12, 24
 START = dt.datetime(2026, 1, 12, 8, 0, tzinfo=dt.UTC)
@@ -118,6 +122,41 @@ def rows_of_history(fleet: Fleet, seed: int) -> pl.DataFrame:
                 parts.append(_frame(name, method, parameter, unit, value, own_sd, fleet.temperature))
     order = ["unit_id", "sensor", "method", "parameter", "axis", "started_at", "vehicle_id", "flight_id"]
     return pl.concat(parts).sort(order)
+
+
+def with_information(flights: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """(rows of each sensor's most exact method, as the joint estimate's; the same as rows of `information`)."""
+    from fieldcal.estimation.normal_equations import NormalEquations
+    from fieldcal.stages.joint.information import table_of as rows_of_equations
+
+    exact = pl.col("method") != "equation_error"
+    flights = flights.filter(exact).with_columns(method=pl.lit("joint"))
+    units = {Sensor(name): (UNIT[name], "counts") for name in SENSORS}
+    tables = []
+    for _, own in flights.group_by("unit_id", "session_id", maintain_order=True):
+        value = {(r["sensor"], r["parameter"], r["axis"]): (r["value"], r["sd"]) for r in own.iter_rows(named=True)}
+        names, reference, blocks = [], [], []
+        for sensor in SENSORS:
+            for axis in "xyz":
+                (slope, slope_sd), (found, sd) = (value[sensor, p, axis] for p in ("scale", "zero_bias"))
+                names += [(str(sensor), "gain", axis), (str(sensor), "zero", axis)]
+                reference += [1.0 / slope, MID_SCALE - found / slope]
+                jacobian = np.array([[-1.0 / slope**2, 0.0], [found / slope**2, -1.0 / slope]])
+                inverse = np.linalg.inv(jacobian)
+                blocks.append(inverse.T @ np.diag([slope_sd**-2, sd**-2]) @ inverse)
+        information = block_diag(*blocks)
+        equations = NormalEquations(tuple(names), np.array(reference), np.zeros(len(names)), information)
+        rows = rows_of_equations(equations, [None] * len(names), units)
+        first = own.row(0, named=True)
+        lead = {
+            **{name: first[name] for name in ("flight_id", "vehicle_id", "imu_id", "session_id", "started_at")},
+            "dated_by": "log", "sequence": None, "unit_id": first["unit_id"], "is_primary": True,
+            "sensor_unit_id": first["unit_id"], "run_key": None, "temperature_degc": first["temperature_degc"],
+        }  # fmt: skip
+        empty = empty_frame("information")
+        rows = rows.with_columns(**{name: pl.lit(v) for name, v in lead.items() if name in empty.columns})
+        tables.append(rows.select(empty.columns).cast(dict(empty.schema)))
+    return flights, pl.concat(tables)
 
 
 def _frame(
@@ -209,7 +248,7 @@ def judged(table: pl.DataFrame, fleet: Fleet) -> dict[str, Any]:
     error = gyro["slope_per_degc"].to_numpy() - truth
     sd = gyro["slope_per_degc_sd"].to_numpy()
     within = np.abs(error) <= np.maximum(SLOPE_BAR * np.abs(truth), 3.0 * sd)
-    best = gyro.filter(method="output_error")
+    best = gyro.filter(pl.col("method").is_in(["output_error", "joint"]))
 
     def row(u: int, axis: str) -> dict[str, Any]:
         return best.row(by_predicate=(pl.col("unit") == u) & (pl.col("axis") == axis), named=True)
@@ -217,7 +256,7 @@ def judged(table: pl.DataFrame, fleet: Fleet) -> dict[str, Any]:
     step = row(STEP_UNIT, "x")
     others = calibrated.filter(~pl.col("unit").is_in([STEP_UNIT, DRIFTING_UNIT, OUTLIER_UNIT]))
     late = None if step["change_at"] is None else (step["change_at"] - START).days / 7 - STEP_SESSION
-    last_word = (gyro["method"] == "output_error").to_numpy()
+    last_word = gyro["method"].is_in(["output_error", "joint"]).to_numpy()
     return {
         "slopes within 5 % or 3 sd": float(within.mean()),
         "of output error": float(within[last_word].mean()),
@@ -238,15 +277,18 @@ def judged(table: pl.DataFrame, fleet: Fleet) -> dict[str, Any]:
     }
 
 
-def as_rows(seeds: int, first: int, understated: float) -> None:
+def as_rows(seeds: int, first: int, understated: float, *, pooled: bool = False) -> None:
     found, seconds = [], 0.0
     equation = pl.col("method") == "equation_error"
     for seed in range(first, first + seeds):
         fleet = draw(seed)
         flights = rows_of_history(fleet, seed)
         flights = flights.with_columns(sd=pl.when(equation).then(pl.col("sd") / understated).otherwise("sd"))
+        information = empty_frame("information")
+        if pooled:
+            flights, information = with_information(flights)
         begun = time.process_time()
-        table = table_of(flights)
+        table = table_of(flights, pooled=pooled_of(information))
         seconds += time.process_time() - begun
         found.append(judged(table, fleet))
     error = np.array([f["error / sd of slopes, rms"] for f in found])
@@ -269,7 +311,7 @@ def as_rows(seeds: int, first: int, understated: float) -> None:
     print(f"  {'step size within 15 %':32s} {sized:.4f}   (rms {rms:.3f})")
     unstable = np.array([f["of them not stable"] for f in found])
     print(f"  {'other rows not stable':32s} {unstable.mean():.4f}   (worst fleet {unstable.max():.4f})")
-    for name in (f"rms of {method}" for method in METHODS["gyroscope"]):
+    for name in () if pooled else [f"rms of {method}" for method in METHODS["gyroscope"]]:
         print(f"  {name:32s} {np.sqrt(np.mean([f[name] ** 2 for f in found])):.3f}")
     rms = np.sqrt(np.mean(error**2))
     print(f"  {'error / sd of slopes, rms':32s} {rms:.3f}   (fleets {error.min():.2f} to {error.max():.2f})")
@@ -332,6 +374,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=100, help="fleets that are rows")
     parser.add_argument("--first-seed", type=int, default=0, help="of the fleets that are rows")
     parser.add_argument("--sessions", type=int, help="of a unit, without spoiled flights; else 24 with them")
+    parser.add_argument("--pooled", action="store_true", help="rows with their information")
     parser.add_argument("--tell", action="store_true", help="how many more sessions would tell, and did")
     parser.add_argument("--understated", type=float, default=1.0, help="equation error states its sd so much too small")
     parser.add_argument("--logs", type=Path, help="one fleet as logs, in this folder")
@@ -344,7 +387,7 @@ def main() -> None:
     if options.tell:
         as_told(options.seeds, options.first_seed)
     elif options.logs is None:
-        as_rows(options.seeds, options.first_seed, options.understated)
+        as_rows(options.seeds, options.first_seed, options.understated, pooled=options.pooled)
     else:
         as_logs(options.logs, options.seed, options.duration, options.workers)
 

@@ -1,7 +1,9 @@
 """Weak flights pooled, where the truth is known: what all know together, and whether its sd are honest.
 
     python benchmarks/pooled.py flights [--vehicles 6] [--flights 40] [--jobs 2]    simulated flights through the stages
+    python benchmarks/pooled.py flights --motion mission [--without] [--seconds 60]   ordinary ones, by velocity or not
     python benchmarks/pooled.py together [--rounds 5]       pooled parts of a recording against one fit of all of it
+    python benchmarks/pooled.py claims [--fleets 4]         error ÷ sd of units drawn without signals
     python benchmarks/pooled.py alarms [--fleets 100]       units without a fault: how many are told of one
     python benchmarks/pooled.py cost [--units 500] [--flights 200]                  cold, and after one new flight
     python benchmarks/pooled.py real ARCHIVE … [--piece 20]  recordings cut into pieces against their reference
@@ -34,6 +36,7 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import SENSORS, Sensor
 from fieldcal.simulation.archive import settings, signals
 from fieldcal.simulation.experiment import Experiment, simulate
+from fieldcal.simulation.ordinary import ordinary_flight
 from fieldcal.stages.joint.information import equations_of
 from fieldcal.stages.joint.information import table_of as rows_of_equations
 from fieldcal.stages.pipeline import run_flight
@@ -106,11 +109,22 @@ def experiment(rng: np.random.Generator, constants: Array, degc: float, seed: in
     )  # fmt: skip
 
 
-def flown(e: Experiment) -> dict[str, pl.DataFrame]:
+def ordinary(motion: str, constants: Array, degc: float, seed: int, seconds: float) -> Experiment:
+    """A flight that nobody flew for a calibration, with a receiver's velocity."""
+    value = dict(zip(NAMES, constants, strict=True))
+    gain = {s: np.array([value[s, "gain", a] for a in "xyz"]) for s in UNITS}
+    zero = {s: np.array([value[s, "zero", a] for a in "xyz"]) for s in UNITS}
+    return ordinary_flight(
+        motion, seed, duration_s=seconds, temperature_degc=(degc, degc),
+        scale={s: tuple(1.0 / gain[s]) for s in UNITS}, bias={s: tuple(-zero[s] / gain[s]) for s in UNITS},
+    )  # fmt: skip
+
+
+def flown(e: Experiment, known: dict[str, Any]) -> dict[str, pl.DataFrame]:
     """`calibration` and `information` of one flight, as stages write them; fewer where they could not run."""
     r = simulate(e)
     with threadpool_limits(1):
-        results = run_flight(signals(r), settings(e, **KNOWN))
+        results = run_flight(signals(r), settings(e, **known))
     return {name: t for name, t in results["composition"].tables.items() if name in ("calibration", "information")}
 
 
@@ -128,9 +142,9 @@ def led(rows: pl.DataFrame, vehicle: int, flight: int, session: int, day: float)
     return own.select(empty.columns).cast(dict(empty.schema))
 
 
-def one_flight(task: tuple[int, int, int, float, Experiment]) -> tuple[pl.DataFrame, pl.DataFrame]:
-    vehicle, flight, session, day, e = task
-    tables = flown(e)
+def one_flight(task: tuple[int, int, int, float, Experiment, dict[str, Any]]) -> tuple[pl.DataFrame, pl.DataFrame]:
+    vehicle, flight, session, day, e, known = task
+    tables = flown(e, known)
 
     def of(name: str) -> pl.DataFrame:
         return led(tables[name], vehicle, flight, session, day) if name in tables else empty_frame(name)
@@ -138,17 +152,31 @@ def one_flight(task: tuple[int, int, int, float, Experiment]) -> tuple[pl.DataFr
     return of("information"), of("calibration")
 
 
-def fleet(vehicles: int, flights: int, per_session: int = 2, jobs: int = 1, seed: int = 0) -> tuple[Any, ...]:
-    """(information, calibration, truths) of simulated flights."""
+def fleet(
+    vehicles: int,
+    flights: int,
+    per_session: int = 2,
+    jobs: int = 1,
+    seed: int = 0,
+    motion: str | None = None,
+    use_velocity: bool = True,
+    seconds: float = 60.0,
+) -> tuple[Any, ...]:
+    """(information, calibration, truths) of simulated flights; by hand where there is no `motion`."""
     truths, tasks = [], []
+    known = KNOWN if motion is None else {"method": "auto", "use_velocity": use_velocity}
     for vehicle in range(vehicles):
         rng = np.random.default_rng([seed, vehicle])
         truth = Truth(rng, -(-flights // per_session))
         truths.append(truth)
         for flight in range(flights):
             session, degc = flight // per_session, float(rng.uniform(5.0, 35.0))
-            e = experiment(rng, truth.of_flight(session, degc), degc, seed=10_000 * seed + 100 * vehicle + flight)
-            tasks.append((vehicle, flight, session, float(truth.day[session]), e))
+            at, number = truth.of_flight(session, degc), 10_000 * seed + 100 * vehicle + flight
+            if motion is None:
+                e = experiment(rng, at, degc, seed=number)
+            else:
+                e = ordinary(motion, at, degc, number, seconds)
+            tasks.append((vehicle, flight, session, float(truth.day[session]), e, known))
     if jobs == 1:
         made = list(map(one_flight, tasks))
     else:
@@ -157,11 +185,17 @@ def fleet(vehicles: int, flights: int, per_session: int = 2, jobs: int = 1, seed
     return pl.concat([a for a, _ in made]), pl.concat([b for _, b in made]), truths
 
 
-def flights(vehicles: int, count: int, jobs: int) -> None:
+def flights(vehicles: int, count: int, jobs: int, motion: str | None, *, velocity: bool, seconds: float) -> None:
     """Rows alone against pooled, error ÷ sd."""
     began = time.perf_counter()
-    information, calibration, truths = fleet(vehicles, count, jobs=jobs)
+    made = fleet(vehicles, count, jobs=jobs, motion=motion, use_velocity=velocity, seconds=seconds)
     print(f"{vehicles} vehicles, {count} flights each: {time.perf_counter() - began:.0f} s of stages")
+    against_truth(*made)
+
+
+def against_truth(information: pl.DataFrame, calibration: pl.DataFrame, truths: Sequence[Truth]) -> None:
+    """The table of rows alone and pooled, axes apart; error ÷ sd."""
+    vehicles = len(truths)
     table = table_of(information)
     print(
         "| constant | rows ok of flights | error ÷ sd | pooled ok of vehicles | error ÷ sd | median sd alone, pooled |"
@@ -169,23 +203,28 @@ def flights(vehicles: int, count: int, jobs: int) -> None:
     print("|---|---|---|---|---|---|")
     for kind in SCATTER:
         sensor, parameter = kind[0], "scale" if kind[1] == "gain" else "zero"
-        alone = calibration.filter(sensor=sensor, parameter=parameter, method="joint").filter(
-            pl.col("axis").str.len_chars() == 1
+        alone = calibration.filter(sensor=sensor, parameter=parameter).filter(
+            pl.col("axis").str.len_chars() == 1, pl.col("method").is_in(["joint", "velocity"])
         )
         ok = alone.filter(status="ok")
         z = [_z(row, truths, last=False) for row in ok.iter_rows(named=True)]
         pooled = table.filter(sensor=sensor, parameter=parameter)
-        told = pooled.filter(pl.col("status").is_in(["ok", "step"]))
+        told = pooled.filter(pl.col("status").is_in(["ok", "step", "drifting"]))
         pooled_z = [_z(row, truths, last=True) for row in told.iter_rows(named=True)]
         print(
-            f"| {sensor} {parameter} | {ok.height} of {alone.height} | {_rms(z):.2f} | {told.height} of {3 * vehicles} "
-            f"| {_rms(pooled_z):.2f} | {ok['sd'].median() or np.nan:.2g}, {told['sd'].median() or np.nan:.2g} |"
+            f"| {sensor} {parameter} | {_by_axis(ok)} of {alone.height // 3} | {_rms(z):.2f} "
+            f"| {_by_axis(told)} of {vehicles} | {_rms(pooled_z):.2f} "
+            f"| {ok['sd'].median() or np.nan:.2g}, {told['sd'].median() or np.nan:.2g} |"
         )
     print(
         "left out:",
         table.select(pl.col("left_out").list.len().max().over("pooled_with")).to_series().unique().to_list(),
     )
     print("steps:", table.filter(status="step").height, "refused:", table.filter(status="refused").height)
+
+
+def _by_axis(rows: pl.DataFrame) -> str:
+    return " ".join(str(rows.filter(axis=axis).height) for axis in "xyz")
 
 
 def _z(row: dict[str, Any], truths: Sequence[Truth], *, last: bool) -> float:
@@ -231,12 +270,18 @@ def together(rounds: int) -> None:
 
 
 def drawn(
-    rng: np.random.Generator, sessions: int, *, seen: int = 9, step: tuple[int, int, float] | None = None
+    rng: np.random.Generator,
+    sessions: int,
+    *,
+    seen: int = 9,
+    step: tuple[int, int, float] | None = None,
+    scatters: float = 3.0,
+    truth: Truth | None = None,
 ) -> Unit:
-    """A unit as flights' information, without signals: each shows `seen` random directions of the 18. `step`: session,
-    constant, and by how many scatters."""
-    truth = Truth(rng, sessions)
-    sd = of_names(SCATTER) * 3.0
+    """A unit as flights' information, without signals: each shows `seen` random directions of the 18, to so many
+    `scatters` of sessions. `step`: session, constant, and by how many scatters."""
+    truth = truth or Truth(rng, sessions)
+    sd = of_names(SCATTER) * scatters
     made = []
     for session in range(sessions):
         degc = float(rng.uniform(5.0, 35.0))
@@ -249,6 +294,31 @@ def drawn(
         equations = NormalEquations(NAMES, nominal, look.T @ (reading - look @ nominal), look.T @ look)
         made.append(Flight(equations, session, degc - 25.0))
     return Unit(tuple(made), truth.day)
+
+
+def claims(fleets: int, units: int = 6) -> None:
+    """Error ÷ sd, rms, by kind, sessions and how well a flight knows the constants."""
+    print("| sessions | directions | sd of one, in scatters | " + " | ".join(" ".join(kind) for kind in SCATTER) + " |")
+    for sessions in (2, 4, 8, 20):
+        for seen, scatters in ((12, 3.0), (30, 3.0), (30, 0.1)):
+            z: dict[tuple[str, str], list[float]] = {kind: [] for kind in SCATTER}
+            for number in range(fleets):
+                rngs = [np.random.default_rng([number, unit, sessions]) for unit in range(units)]
+                truths = [Truth(rng, sessions) for rng in rngs]
+                drawn_units = [
+                    drawn(rng, sessions, seen=seen, scatters=scatters, truth=truth)
+                    for rng, truth in zip(rngs, truths, strict=True)
+                ]
+                kinds = strengths(drawn_units)
+                for unit, truth in zip(drawn_units, truths, strict=True):
+                    found = pool(unit, kinds)
+                    now, sd = found.at(), np.sqrt(np.diagonal(found.at().covariance))
+                    for place, name in enumerate(found.names):
+                        if np.isfinite(sd[place]):
+                            off = now.state[place] - truth.walked[-1][NAMES.index(name)]
+                            z[name[:2]].append(float(off / sd[place]))
+            cells = " | ".join(f"{_rms(values):.2f}" for values in z.values())
+            print(f"| {sessions} | {seen} | {scatters:g} | {cells} |", flush=True)
 
 
 def alarms(fleets: int, units: int = 12, counts: Sequence[int] = (4, 8, 12, 24)) -> dict[int, tuple[int, int, int]]:
@@ -345,7 +415,7 @@ def real(archives: Sequence[Path], piece_s: float) -> None:
                     continue
                 for j, parameter in enumerate(("scale", "zero")):
                     told = table.filter(sensor=str(sensor), parameter=parameter).filter(
-                        pl.col("status").is_in(["ok", "step"])
+                        pl.col("status").is_in(["ok", "step", "drifting"])
                     )
                     for row in told.iter_rows(named=True):
                         i = "xyz".index(row["axis"])
@@ -363,10 +433,13 @@ def real(archives: Sequence[Path], piece_s: float) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("flights", "together", "alarms", "cost", "real"))
+    parser.add_argument("what", choices=("flights", "together", "claims", "alarms", "cost", "real"))
     parser.add_argument("archive", nargs="*", type=Path)
     parser.add_argument("--vehicles", type=int, default=6)
     parser.add_argument("--flights", type=int, default=40)
+    parser.add_argument("--motion", choices=("mission", "lively", "hover", "fixed_wing"))
+    parser.add_argument("--without", action="store_true", help="the receiver's velocity is not used")
+    parser.add_argument("--seconds", type=float, default=60.0, help="that an ordinary flight lasts")
     parser.add_argument("--units", type=int, default=500)
     parser.add_argument("--fleets", type=int, default=100)
     parser.add_argument("--rounds", type=int, default=5)
@@ -374,9 +447,18 @@ def main() -> None:
     parser.add_argument("--piece", type=float, default=20.0)
     given = parser.parse_args()
     if given.what == "flights":
-        flights(given.vehicles, given.flights, given.jobs)
+        flights(
+            given.vehicles,
+            given.flights,
+            given.jobs,
+            given.motion,
+            velocity=not given.without,
+            seconds=given.seconds,
+        )
     elif given.what == "together":
         together(given.rounds)
+    elif given.what == "claims":
+        claims(min(given.fleets, 4))
     elif given.what == "alarms":
         alarms(given.fleets)
     elif given.what == "cost":

@@ -317,6 +317,13 @@ SHARES = Column(
     "1",
     "by flights: share of what was known of the parameter then that would not have been known without the flight",
 )
+DISTANCES = Column(
+    "distances",
+    pa.list_(_F64),
+    "1",
+    "by flights: distance of the scales at which its equations were made from the pooled ones, over that up to which they "
+    "hold; beyond 1 it is left out",
+)
 LEFT_OUT = Column("left_out", pa.list_(_TEXT), "", "flight_id of each flight that contradicts the others, left out")
 
 # --- fit
@@ -350,7 +357,7 @@ STATUS = Column(
     _TEXT,
     "",
     "outcome: ok, refused, absent, failed, or withdrawn by a decision (`drift`: stable, drifting, step, outlier, "
-    "insufficient; `pooled`: ok, step, refused, or insufficient where the last session contradicts the others)",
+    "insufficient; `pooled`: ok, step, drifting, refused, or insufficient where the last session contradicts the others)",
 )
 
 # --- run
@@ -384,7 +391,12 @@ CURVE_PER_DEGC2, CURVE_PER_DEGC2_SD, CURVE_PER_DEGC3, CURVE_PER_DEGC3_SD = (
 )
 SLOPE_PER_DAY = Column("slope_per_day", _F64, "column unit per day", "change with time")
 SLOPE_PER_DAY_SD = Column("slope_per_day_sd", _F64, "column unit per day", "standard deviation of slope_per_day")
-LAST_Z = Column("last_z", _F64, "1", "distance of the last flight from the regression, in standard deviations")
+LAST_Z = Column(
+    "last_z",
+    _F64,
+    "1",
+    "distance of the last flight from the regression (`pooled`: of the last session from all others), in standard deviations",
+)
 CHANGE_AT = Column(
     "change_at",
     pa.timestamp("us", tz="UTC"),

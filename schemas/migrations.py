@@ -61,6 +61,7 @@ CHANGES: tuple[Change, ...] = (
     Change("flight", 2, _ORDER),
     # Some of version 2 have these already.
     *(Change(table, 3, _ORDER) for table in ("calibration", "fit", "sync", "run")),
+    Change("pooled", 2, dict.fromkeys(("slope_per_day", "slope_per_day_sd", "last_z", "distances"))),
 )
 """In the order in which they came."""
 

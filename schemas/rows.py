@@ -224,6 +224,9 @@ class PooledRow(UnitLead):
     sd: float | None
     slope_per_degc: float | None
     slope_per_degc_sd: float | None
+    slope_per_day: float | None
+    slope_per_day_sd: float | None
+    last_z: float | None
     best_known_degc: float | None
     temperature_min_degc: float | None
     temperature_max_degc: float | None
@@ -242,6 +245,7 @@ class PooledRow(UnitLead):
     flights: list[str]
     shares: list[float]
     left_out: list[str]
+    distances: list[float] | None
     status: str
     reason_code: str | None
     reason: str | None

@@ -321,7 +321,7 @@ _HISTORY = (
     Table(
         "pooled",
         "history",
-        1,
+        2,
         "one row a unit, sensor, parameter and axis: what all flights together say of it, led by the last one",
         (
             *c.LEAD,
@@ -334,6 +334,9 @@ _HISTORY = (
             c.SD,
             c.SLOPE_PER_DEGC,
             c.SLOPE_PER_DEGC_SD,
+            c.SLOPE_PER_DAY,
+            c.SLOPE_PER_DAY_SD,
+            c.LAST_Z,
             c.BEST_KNOWN_DEGC,
             c.TEMPERATURE_MIN_DEGC,
             c.TEMPERATURE_MAX_DEGC,
@@ -352,6 +355,7 @@ _HISTORY = (
             c.FLIGHTS_POOLED,
             c.SHARES,
             c.LEFT_OUT,
+            c.DISTANCES,
             c.STATUS,
             c.REASON_CODE,
             c.REASON,

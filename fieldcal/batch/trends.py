@@ -26,12 +26,11 @@ def update_trends(root: Path) -> set[str]:
         As `fieldcal.trends.drift_table.update_drift`.
     """
     from fieldcal.trends.drift_table import update_drift  # regressions, which a night with nothing new does not need
-    from fieldcal.trends.pooled.table import update_pooled
 
     changed: set[str] = set()
     for _ in range(_MOST_ROUNDS):
         made_from = history_digest(root, INPUTS)
-        changed |= {*update_drift(root), *update_pooled(root)}
+        changed |= set(update_drift(root))
         if not refresh(root) or history_digest(root, INPUTS) == made_from:
             break
     return changed

@@ -56,7 +56,8 @@ def pooled(
         What they were at another moment, by all flights before and after it: 2026-02-01, or with a time, UTC.
     flights
         Instead how much each flight contributed: the share of what was known then that would not have been without it;
-        none where it contradicts the others and was left out.
+        none where it contradicts the others and was left out. Distance beyond 1: its equations were made at scales too
+        far from these to hold, and it is left out until its log is calibrated again.
     """
     import polars as pl
 
@@ -68,9 +69,12 @@ def pooled(
     rows = fieldcal.Warehouse(warehouse).pooled(vehicle=vehicle, sensor=sensor, parameter=parameter, at=at)
     if flights:
         place = ["vehicle_id", "unit_id", "sensor", "parameter", "axis"]
-        each = rows.select(*place, "flights", "shares", "left_out").explode("flights", "shares")
+        # A row of an older night has none.
+        unknown = pl.col("shares").list.eval(pl.when(pl.element().is_nan()).then(pl.element()))
+        each = rows.select(*place, "flights", "shares", pl.coalesce("distances", unknown), "left_out")
+        each = each.explode("flights", "shares", "distances")
         out = pl.col("left_out").list.contains(pl.col("flights"))
-        shown = each.select(*place, flight_id="flights", share="shares", left_out=out)
+        shown = each.select(*place, flight_id="flights", share="shares", distance="distances", left_out=out)
         print_frame(shown, as_json=as_json, as_csv=as_csv, wide=wide)
         return 0
     if as_json or as_csv:

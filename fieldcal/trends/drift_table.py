@@ -20,6 +20,8 @@ from fieldcal.trends.evidence import evidence
 from fieldcal.trends.evidence_cache import Memory
 from fieldcal.trends.more_sessions import needed
 from fieldcal.trends.one_sensor import of_present_sensor, told
+from fieldcal.trends.pooled import verdicts
+from fieldcal.trends.pooled.table import pooled_table, update_pooled
 from fieldcal.trends.reasons import AGREEMENT, VPS, reason
 from fieldcal.trends.series import Histories
 from fieldcal.trends.warm_up_slopes import slopes_of_warm_ups
@@ -42,7 +44,8 @@ ATTEMPTS = 10
 
 
 def update_drift(root: Path) -> tuple[str, ...]:
-    """Publish the trends of every unit under the vehicle that carries it now; the vehicles whose table changed.
+    """Publish the trends of every unit under the vehicle that carries it now, tables `pooled` and `drift`; the vehicles
+    whose tables changed.
 
     A function of the history alone: the same history gives the same bytes, and then nothing is written. Units whose
     history did not change are not regressed again (`evidence_cache`); the fleet is judged anew from all. When another
@@ -56,8 +59,9 @@ def update_drift(root: Path) -> tuple[str, ...]:
     changed: set[str] = set()
     for _ in range(ATTEMPTS):
         before = _state(root)
+        changed |= set(update_pooled(root))
         memory = Memory(root, run_key("evidence", source_digest(evidence), {}, {}))
-        table = drift_table(root, memory)
+        table = drift_table(root, memory, Warehouse(root).scan("pooled").collect())
         memory.save()
         for vehicle_id in sorted(set(table["vehicle_id"].to_list()) | _with_drift(root)):
             if publish(root, vehicle_id, {"drift": table.filter(pl.col("vehicle_id") == vehicle_id)}, ()):
@@ -67,21 +71,30 @@ def update_drift(root: Path) -> tuple[str, ...]:
     return tuple(sorted(changed))
 
 
-def drift_table(root: Path, memory: Memory | None = None) -> pl.DataFrame:
-    """The table `drift` as the history has it now; nothing is written."""
-    return table_of(history_of_everything(root), bends_of(root), memory)
+def drift_table(root: Path, memory: Memory | None = None, pooled: pl.DataFrame | None = None) -> pl.DataFrame:
+    """The table `drift` as the history has it now; nothing is written. `pooled`: that table, else it is made."""
+    pooled = pooled_table(root) if pooled is None else pooled
+    return table_of(history_of_everything(root), bends_of(root), memory, pooled)
 
 
-def table_of(flights: pl.DataFrame, bends: Bends = NO_BENDS, memory: Memory | None = None) -> pl.DataFrame:
-    """The table `drift` of `history_of_everything`'s rows and of `bends_of`'s curves."""
-    if flights.is_empty():
+def table_of(
+    flights: pl.DataFrame,
+    bends: Bends = NO_BENDS,
+    memory: Memory | None = None,
+    pooled: pl.DataFrame | None = None,
+) -> pl.DataFrame:
+    """The table `drift` of `history_of_everything`'s rows, of `bends_of`'s curves and of the table `pooled`."""
+    pooled = empty_frame("pooled") if pooled is None else pooled
+    if flights.is_empty() and pooled.is_empty():
         return empty_frame("drift")
     flights, doubts = temperatures.judged(flights)
     flights, exchanged = of_present_sensor(flights)
-    rows, trends, borrowed = trends_of(flights, bends, memory or Memory())
+    known = verdicts.read(flights, *trends_of(flights, bends, memory or Memory()), pooled)
+    rows, trends = known.rows, known.trends
     group, kind, value, sd = _siblings(rows, trends)
-    stepped, drifting = regression.moving(trends)
-    fleet_z, fleet_p = siblings.sibling_distance(group, value, sd, doubtful=stepped | drifting, kind=kind)
+    stepped, drifting = regression.moving(known.judged)
+    doubtful = stepped | drifting | known.moving
+    fleet_z, fleet_p = siblings.sibling_distance(group, value, sd, doubtful=doubtful, kind=kind)
     result = rows.with_columns(
         **{
             name: pl.Series(np.asarray(column, dtype=float), nan_to_null=True)
@@ -100,17 +113,17 @@ def table_of(flights: pl.DataFrame, bends: Bends = NO_BENDS, memory: Memory | No
                 "fleet_z": fleet_z,
             }.items()
         },
-        borrowed_from=pl.Series(borrowed, nan_to_null=True).cast(pl.Int64),
+        borrowed_from=pl.Series(known.borrowed, nan_to_null=True).cast(pl.Int64),
         n_flights=pl.Series(trends.n_flights).cast(pl.Int64),
         n_sessions=pl.Series(trends.n_sessions).cast(pl.Int64),
         change_at=_moments(trends.change_day),
         best_known_at=_moments(trends.best_day),
-        status=pl.Series(regression.statuses(trends, fleet_p).tolist(), dtype=pl.String),
+        status=pl.Series(known.statuses(regression.statuses(known.judged, fleet_p)).tolist(), dtype=pl.String),
     )
     more = needed(trends)
     rows_made = typed(result.iter_rows(named=True), DriftRow)
     reasons = [reason(row, int(n)) for row, n in zip(rows_made, more, strict=True)]
-    explained = told(result.with_columns(reason=pl.Series(reasons, dtype=pl.String)), exchanged)
+    explained = told(result.with_columns(reason=pl.Series(known.with_words(reasons), dtype=pl.String)), exchanged)
     explained = temperatures.with_notes(explained, doubts)
     return explained.select(TABLES["drift"].column_names).sort(KEY)
 

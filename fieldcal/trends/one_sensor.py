@@ -1,12 +1,15 @@
 """Flights of one unit that are of another sensor: it was exchanged, and nobody told.
 
 A sensor is known by its scales. They hold to a fraction of a per cent over temperature and years, and are several per
-cent apart from part to part, while a zero may step by itself. Where two axes or more have another scale, another sensor
-was on board. Trends are of the one that flew last; what flew besides is told and not averaged with it.
+cent apart from part to part, while a zero may step by itself. Where two axes or more have another scale, and another
+flight has the same on all, another sensor was on board: a flight that is like no other was spoiled, or is the first of
+its sensor, and is for the regression to judge. Trends are of the sensor that flew last; what flew besides is told and
+not averaged with it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -24,6 +27,8 @@ OTHER_SHARE, OTHER_SD = 0.015, 6.0
 """A scale is another one's from this share of it on (temperature moves it by less), and from so many sd on."""
 LEAST_AXES = 2
 """Axes whose scales are another's: one alone may be spoiled."""
+SAME_SD = 3.0
+"""A scale is the same from so few sd on, or less than `OTHER_SHARE` of it."""
 
 
 @dataclass(frozen=True)
@@ -59,16 +64,19 @@ def of_present_sensor(flights: pl.DataFrame) -> tuple[pl.DataFrame, dict[tuple[s
     for (unit_id, sensor), own in _suspects(flights).group_by("unit_id", "sensor", maintain_order=True):
         scales, sd = (own.select(f"{name}_{axis}" for axis in AXES).to_numpy() for name in ("value", "sd"))
         which = _grouped(scales, sd)
-        present = which == which[-1]
+        of_sensor = _confirmed(scales, sd, which)
+        if not of_sensor.any():
+            continue
+        present = ~of_sensor | (which == which[of_sensor][-1])
         if present.all():
             continue
         since = int(np.flatnonzero(~present)[-1]) + 1
-        reference = scales[present].mean(axis=0)
+        reference = scales[present & of_sensor].mean(axis=0)
         exchanged[str(unit_id), str(sensor)] = Exchange(
             own["started_at"][since],
             int(np.sum(~present)),
             len(own),
-            bool(present[:since].any()),
+            bool((present & of_sensor)[:since].any()),
             float(np.max(np.abs(scales[~present] / reference - 1.0))),
         )
         dropped.append(own.filter(pl.Series(~present)).select("unit_id", "sensor", "flight_id"))
@@ -79,8 +87,13 @@ def of_present_sensor(flights: pl.DataFrame) -> tuple[pl.DataFrame, dict[tuple[s
     return flights, exchanged
 
 
-def told(table: pl.DataFrame, exchanged: dict[tuple[str, str], Exchange]) -> pl.DataFrame:
-    """The table `drift` with what was exchanged: a unit of which one sensor flew after another has stepped."""
+def told(
+    table: pl.DataFrame,
+    exchanged: dict[tuple[str, str], Exchange],
+    steady: Sequence[str] = (DriftStatus.STABLE, DriftStatus.INSUFFICIENT),
+) -> pl.DataFrame:
+    """The table `drift` or `pooled` with what was exchanged: a unit of which one sensor flew after another has stepped,
+    where its status was one of `steady`."""
     if not exchanged:
         return table
     rows = [
@@ -93,7 +106,7 @@ def told(table: pl.DataFrame, exchanged: dict[tuple[str, str], Exchange]) -> pl.
     both = table.join(pl.DataFrame(rows, schema=schema), on=["unit_id", "sensor"], how="left", maintain_order="left")
     other = pl.col("exchange").is_not_null()
     return both.with_columns(
-        status=pl.when(other & pl.col("status").is_in([DriftStatus.STABLE, DriftStatus.INSUFFICIENT]))
+        status=pl.when(other & pl.col("status").is_in([str(status) for status in steady]))
         .then(pl.lit(str(DriftStatus.STEP)))
         .otherwise("status"),
         change_at=pl.when(other).then(pl.coalesce("change_at", "since")).otherwise("change_at"),
@@ -154,6 +167,21 @@ def _grouped(scales: Array, sd: Array) -> np.ndarray:
             which[flight] = len(known)
             known.append([flight])
     return which
+
+
+def _confirmed(scales: Array, sd: Array, which: np.ndarray) -> np.ndarray:
+    """Whether each flight (n,) is of a sensor of which two have the same scales on every axis."""
+    out = np.zeros(len(which), dtype=bool)
+    for number in range(which.max() + 1):
+        members = np.flatnonzero(which == number)
+        for place, one in enumerate(members[:-1]):
+            others = members[place + 1 :]
+            off = np.abs(scales[others] - scales[one])
+            same = (off < OTHER_SHARE * np.abs(scales[one])) | (off < SAME_SD * np.hypot(sd[others], sd[one]))
+            if same.all(axis=1).any():
+                out[members] = True
+                break
+    return out
 
 
 def _distance(scales: Array, sd: Array, flight: int, members: list[int]) -> float:

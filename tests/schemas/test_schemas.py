@@ -152,7 +152,7 @@ FORMS = {
     "run": (3, "ac506f44"),
     "information": (1, "0f251e66"),
     "drift": (4, "e8fac4a1"),
-    "pooled": (1, "02e3c101"),
+    "pooled": (2, "cbd133c0"),
     "decision": (1, "ba9619df"),
     "export": (1, "a1abda15"),
 }

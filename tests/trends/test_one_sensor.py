@@ -93,6 +93,26 @@ def test_a_scale_that_is_a_little_off_is_the_same_sensor(tmp_path: Path, odd: np
     assert set(table["status"]) == {"stable"}
 
 
+def test_flights_that_are_like_no_other_are_spoiled_not_of_another_sensor(tmp_path: Path) -> None:
+    """Two that a magnet spoiled, each in its own way, amid ten: no exchange; the others' value stands."""
+    odd = {3: SCALES["A"] * [1.2, 0.85, 1.15], 7: SCALES["A"] * [0.8, 1.25, 0.9]}
+    table = night(tmp_path, "AAAAAAAAAAAA", scale=odd)
+    assert set(table["status"]) == {"stable"}
+    assert table["n_flights"].to_list() == [12] * 3
+    scales = drift_table(tmp_path).filter(parameter="scale")
+    assert scales["n_flights"].to_list() == [10] * 3, "set aside, flight by flight"
+    assert "sensor" not in "".join(r or "" for r in scales["reason"])
+    np.testing.assert_allclose(scales["value_at_25degc"].to_numpy(), SCALES["A"], atol=4.0 * SCALE_SD)
+
+
+def test_a_new_sensor_is_told_from_a_spoiled_flight_by_its_second(tmp_path: Path) -> None:
+    first = night(tmp_path / "one", "AAAAAAAB")
+    assert not first["reason"].str.contains("The sensor was exchanged").any()
+    second = night(tmp_path / "two", "AAAAAAABB")
+    assert second["reason"].str.starts_with("The sensor was exchanged").all()
+    assert second["n_flights"].to_list() == [2] * 3
+
+
 def test_what_is_uncertain_is_the_same_sensor(tmp_path: Path) -> None:
     """3 % off at 6 sd or less proves nothing."""
     records: list[dict[str, Any]] = []

@@ -15,6 +15,7 @@ from fieldcal.names import Sensor
 from fieldcal.stages.joint.information import table_of as rows_of_equations
 from fieldcal.trends.pooled.memory import PLACE, Memory
 from fieldcal.trends.pooled.table import table_of
+from fieldcal.trends.pooled.units import first_that_tell
 
 VEHICLES, SESSIONS = 3, 4
 
@@ -96,3 +97,12 @@ def test_a_damaged_memory_is_not_used(tmp_path: Path, information: pl.DataFrame,
     assert count == VEHICLES
     assert table.equals(first)
     assert pooled(tmp_path, information)[1] == 0
+
+
+@pytest.mark.parametrize(("sessions", "told"), [(1, 1), (5, 5), (31, 31), (32, 32), (40, 32), (63, 32), (64, 64)])
+def test_one_flight_more_leaves_what_many_sessions_tell(sessions: int, told: int) -> None:
+    session = [f"s{k // 2}" for k in range(2 * sessions)]
+    rows = pl.DataFrame({"vehicle_id": "v", "session_id": session, "flight_id": range(2 * sessions)})
+    first = first_that_tell(rows)
+    assert first["session_id"].unique(maintain_order=True).to_list() == [f"s{k}" for k in range(told)]
+    assert first["flight_id"].to_list() == list(range(2 * told))

@@ -10,58 +10,22 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from pooled import NAMES, SCATTER, UNITS, Truth, led
+from pooled import NAMES, UNITS, Truth
+from pooled_support import publish_unit
 
 import fieldcal
 from fieldcal.cli.main import run
-from fieldcal.estimation.normal_equations import NormalEquations
-from fieldcal.geometry.rotation import Array
-from fieldcal.names import Method, Sensor
+from fieldcal.names import Sensor
 from fieldcal.report import write_vehicle_report
-from fieldcal.stages.joint.information import table_of as rows_of_equations
-from fieldcal.stages.results import triad_rows
-from fieldcal.stages.tables import calibration_rows
 from fieldcal.trends.drift_table import update_drift
 from fieldcal.trends.pooled.table import update_pooled
 from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.publish import publish
-from fieldcal.warehouse.store import empty_frame
 
 VEHICLES, SESSIONS = 3, 8
 ALONE = (0, 4)
 """Flights that show every constant by themselves; the others show eight combinations of the 18."""
 UNSEEN = ("accelerometer", "gain", "x")
 """No flight of the last vehicle shows it."""
-
-
-def flight(rng: np.random.Generator, at: Array, seen: int, *, blind: bool) -> NormalEquations:
-    sd = np.array([SCATTER[name[:2]] for name in NAMES]) * 2.0
-    look = rng.normal(size=(seen, 18)) / sd
-    if blind:
-        look[:, NAMES.index(UNSEEN)] = 0.0
-    reading = look @ at + rng.normal(size=seen)
-    nominal = np.array([1.0 if name[1] == "gain" else 0.0 for name in NAMES])
-    return NormalEquations(NAMES, nominal, look.T @ (reading - look @ nominal), look.T @ look)
-
-
-def rows_alone(found: NormalEquations, degc: float) -> pl.DataFrame:
-    """The rows of `calibration` that a flight has by itself."""
-    value = found.reference + np.linalg.solve(found.information, found.right)
-    covariance = np.linalg.inv(found.information)
-    rows = []
-    for sensor in (Sensor.ACCELEROMETER, Sensor.GYROSCOPE, Sensor.MAGNETOMETER):
-        at = [k for k, name in enumerate(NAMES) if name[0] == sensor]
-        gain, zero = value[at[:3]], value[at[3:]]
-        jacobian = np.block(
-            [[np.diag(-1.0 / gain**2), np.zeros((3, 3))], [np.diag(zero / gain**2), np.diag(-1.0 / gain)]]
-        )
-        own = jacobian @ covariance[np.ix_(at, at)] @ jacobian.T
-        unit = UNITS[sensor]
-        rows += triad_rows(
-            sensor, Method.JOINT, np.diag(1.0 / gain), -zero / gain, own, unit=unit, logged_unit=unit,
-            reference_reading=np.zeros(3), temperature_degc=degc,
-        )  # fmt: skip
-    return calibration_rows(rows)
 
 
 @pytest.fixture(scope="module")
@@ -71,32 +35,17 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Truth]]:
         rng = np.random.default_rng([3, vehicle])
         truth = Truth(rng, SESSIONS)
         truths.append(truth)
-        information, calibration, flights = [], [], []
-        for session in range(SESSIONS):
-            degc = float(rng.uniform(10.0, 30.0))
-            strong, blind = session in ALONE, vehicle == VEHICLES - 1
-            found = flight(rng, truth.of_flight(session, degc), 40 if strong else 8, blind=blind)
-            rows = rows_of_equations(found, [None] * 18, {Sensor(s): (u, u) for s, u in UNITS.items()})
-            rows = rows.with_columns(temperature_degc=pl.lit(degc))
-            information.append(led(rows, vehicle, session, session, truth.day[session]))
-            if strong and not blind:
-                own = rows_alone(found, degc)
-                calibration.append(led(own, vehicle, session, session, truth.day[session]))
-            lead = information[-1].row(0, named=True)
-            facts = {"log_uri": lead["flight_id"], "log_format": "mcap", "verdict": "ok"}
-            flights.append({name: {**lead, **facts}.get(name) for name in empty_frame("flight").columns})
-        tables = {
-            "flight": pl.DataFrame(flights, schema=empty_frame("flight").schema),
-            "information": pl.concat(information),
-            "calibration": pl.concat([empty_frame("calibration"), *calibration]),
-        }
-        publish(root, f"v{vehicle}", tables, [row["flight_id"] for row in flights])
-    update_drift(root)
-    assert update_pooled(root) == ("v0", "v1", "v2")
+        blind = vehicle == VEHICLES - 1
+        publish_unit(
+            root, vehicle, rng, truth, SESSIONS, lambda session: 40 if session in ALONE else 8,
+            unseen=UNSEEN if blind else None, alone=lambda session, blind=blind: session in ALONE and not blind,
+        )  # fmt: skip
+    assert update_drift(root) == ("v0", "v1", "v2")
     return root, truths
 
 
 def test_it_is_a_function_of_the_history(fleet: tuple[Path, list[Truth]]) -> None:
+    assert update_drift(fleet[0]) == ()
     assert update_pooled(fleet[0]) == ()
 
 
@@ -157,7 +106,10 @@ def test_sql_history_drift_report_and_export_agree(
         for r in alone:
             spread = np.hypot(r["sd"], 2.0 * own["session_sd"]) + abs(own["slope_per_degc"]) * 20.0
             assert abs(r["value"] - own["value_at_25degc"]) < 5.0 * spread
-        assert drift[key]["n_flights"] == len(ALONE) < own["n_flights"]
+        told = drift[key]
+        for column in ("n_flights", "n_sessions", "value_at_25degc", "sd", "slope_per_degc", "slope_per_day"):
+            assert told[column] == own[column], column
+        assert told["n_flights"] == SESSIONS > len(ALONE)
         # What is exported is what SQL says at that temperature, with its sd.
         triad = constants.triads[Sensor(row["sensor"])]
         then = at_15.filter(sensor=row["sensor"], parameter=row["parameter"], axis=row["axis"]).row(0, named=True)

@@ -14,7 +14,7 @@ import polars.testing
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from history_rows import flight
+from history_rows import flight, lead, rows
 from older_history import age, rewrite
 from outside_ci import outside_ci
 from questions import QUESTIONS, answered
@@ -248,6 +248,16 @@ def test_a_file_from_before_each_change_is_filled(change: Change, tmp_path: Path
     root = older("5af0435", tmp_path)
     upgrade(root)
     path = history_path(root, change.table, "sim-1")
+    if change.table == "pooled":  # no night had it then
+        constant = {
+            "sensor": "gyroscope",
+            "parameter": "zero",
+            "axis": "x",
+            "unit": "rad/s",
+            "shares": [1.0],
+            "place": 0,
+        }
+        publish(root, "sim-1", {"pooled": rows("pooled", {**lead("sim-1", "f"), **constant, "status": "ok"})}, ())
     now = read_history(root, change.table, "sim-1")
     young = {
         name: has

@@ -120,7 +120,7 @@ together AS (
     SELECT a, p
     FROM alone AS a
     FULL JOIN (
-        SELECT * FROM pooled WHERE status IN ('ok', 'step') AND parameter IN ('scale', 'zero', 'lever_arm', 'delay')
+        SELECT * FROM pooled WHERE status IN ('ok', 'step', 'drifting') AND parameter IN ('scale', 'zero', 'lever_arm', 'delay')
     ) AS p
         ON a.unit_id = p.unit_id AND a.sensor = p.sensor AND a.parameter = p.parameter AND a.axis = p.axis
         AND a.unit IS NOT DISTINCT FROM p.unit
@@ -139,7 +139,7 @@ better AS (
                     * coalesce(greatest(epoch(p.started_at) - epoch(a.started_at), 0) / 86400, 0),
                 false
             )
-            ELSE coalesce(p.sd < a.sd, false)
+            ELSE coalesce(p.sd <= a.sd, false)
         END AS by_all
     FROM together
 )

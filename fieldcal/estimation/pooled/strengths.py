@@ -24,11 +24,16 @@ FEW = 4.0
 EXPECTED_SHARE = 0.5
 RISE = 0.3
 """Of minus twice the logarithm of the likelihood that a strength is still likely at: half a standard deviation."""
-TOLERANCES = {"fatol": 1e-4, "xatol": 1e-3}
+TOLERANCES = {"fatol": 0.01, "xatol": 0.02}
+"""Of minus twice the logarithm of the likelihood and of logarithms of variances: well below `RISE` and `GRID`."""
 GRID = 1.25
 """Ratio of neighbouring variances that are told apart."""
-START = 0.2, 0.4, 0.5
-"""Sd of walk, scatter and slope over that of a session itself, from where the likeliest are looked for."""
+START, TIMES = (0.2, 0.4, 0.5), (1.0, 4.0, 16.0, 64.0, 256.0)
+"""Sd of walk, scatter and slope over that of a session itself, and times them, from where the likeliest are looked
+for."""
+
+
+NO_PAIRS = np.zeros((0, 3))
 
 
 @dataclass(frozen=True)
@@ -102,12 +107,15 @@ def innovations(series: Series, strengths: Strengths) -> tuple[Array, Array]:
     return z, variance
 
 
-def strengths_of(series: Series, *, with_slope: bool = True) -> Strengths:
+def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_PAIRS) -> Strengths:
     """The strengths that make the series' innovations likeliest.
 
+    `within` (k, 3): of two flights of a session, which share its scatter, by how much temperature and value differ and
+    the variance of that: slopes are told by them too.
+
     Few innovations cannot tell a little from nothing: then the scatter, and what the slope does over the temperatures
-    flown, are taken for half of a session's own sd. Without
-    any two sessions to compare nothing is known to move, but the scatter is that."""
+    flown, are taken for half of a session's own sd. Nor can they tell a walk or a slope from scatter: what may be
+    either is scatter. Without any two sessions to compare nothing is known to move, but the scatter is that."""
     known = np.isfinite(series.value)
     if not known.any():
         return Strengths(0.0, 0.0, 0.0, FEW)
@@ -132,17 +140,30 @@ def strengths_of(series: Series, *, with_slope: bool = True) -> Strengths:
         started_anew = known.sum() - at.sum()
         likelihood = np.sum(np.log(variance[at] / own) + z[at] ** 2) + started_anew * RESTART_SD**2
         few = _unlikely(strengths.scatter / own)
+        few += FEW * np.log1p(strengths.walk * gap_day / strengths.scatter)
         if with_slope:
             few += _unlikely(strengths.slope / units[2])
+            few += 0.5 * FEW * np.log1p(strengths.slope * range_degc**2 / strengths.scatter)
+            variance = strengths.slope * within[:, 0] ** 2 + within[:, 2]
+            few += np.sum(np.minimum(np.log(variance / own) + within[:, 1] ** 2 / variance, RESTART_SD**2))
         outside = np.sum(np.maximum(np.abs(x) - LIMITS[1], 0.0) ** 2)
         return float(likelihood + few + outside)
 
     size = 3 if with_slope else 2
-    simplex = np.log(np.square(START[:size])) + np.eye(size + 1, size, -1)
-    best = minimize(cost, simplex[0], method="Nelder-Mead", options={**TOLERANCES, "initial_simplex": simplex})
+    start = min((np.log(np.square(at[:size])) for at in _starts(with_slope)), key=cost)
+    simplex = start + np.eye(size + 1, size, -1)
+    best = minimize(cost, start, method="Nelder-Mead", options={**TOLERANCES, "initial_simplex": simplex})
     most = [_largest_likely(cost, best.x, best.fun, i) for i in range(size)]
     found = given(np.array(most))
     return replace(found, freedom=FEW + float(np.isfinite(innovations(series, found)[0]).sum()))
+
+
+def _starts(with_slope: bool) -> list[Array]:
+    """Where the likeliest are looked for from: sessions may be known far better than constants scatter, and were each
+    innovation then a restart, no strength near a session's own sd would be likelier than another."""
+    walk, scatter, slope = START
+    times = TIMES if with_slope else TIMES[:1]
+    return [np.array([walk * a, scatter * a, slope * b]) for a in TIMES for b in times]
 
 
 def _on_grid(value: float) -> float:
@@ -150,8 +171,10 @@ def _on_grid(value: float) -> float:
 
 
 def _unlikely(ratio: float) -> float:
-    """Minus twice the logarithm of the chance of a variance beforehand, over that of a session itself."""
-    return float(FEW * (np.log(ratio) + EXPECTED_SHARE**2 / ratio))
+    """Minus twice the logarithm of the chance of a variance beforehand, over that of a session itself: much less than
+    expected is unlikely, much more hardly, for sessions may be known ever so well."""
+    above = np.log(ratio / EXPECTED_SHARE**2)
+    return float(above if above > 0.0 else FEW * (above + EXPECTED_SHARE**2 / ratio - 1.0))
 
 
 def _largest_likely(cost: Callable[[Array], float], best: Array, least: float, i: int) -> float:
@@ -164,4 +187,4 @@ def _largest_likely(cost: Callable[[Array], float], best: Array, least: float, i
         x[i] = value
         return cost(x) - least - RISE
 
-    return float(brentq(rise, low, high, xtol=1e-3)) if rise(high) > 0.0 else low
+    return float(brentq(rise, low, high, xtol=TOLERANCES["xatol"])) if rise(high) > 0.0 else low

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.stats import f as f_distribution
@@ -20,8 +20,9 @@ OF_SLOPE = {"zero_per_degc": "zero"}
 """Parameters of a flight that are slopes of a constant."""
 FALSE_ALARMS = 0.003
 """Chance that a unit without any has a step, and that it has a flight left out."""
-FEWEST_TO_CONTRADICT, FEWEST_BESIDE_A_STEP = 3, 2
-"""Sessions that it takes to say of one flight that it contradicts; of either side of a step."""
+FEWEST_TO_CONTRADICT, FEWEST_BESIDE_A_STEP, FEWEST_TO_DRIFT = 3, 2, 5
+"""Sessions that it takes to say of one flight that it contradicts; of either side of a step; of a constant that it
+drifts."""
 LARGEST_LEFT_OUT = 0.2
 """Share of flights: where more contradict, nobody knows which."""
 UNTESTABLE = 1e4
@@ -66,6 +67,18 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Rate:
+    """What all sessions say of a steady change of one constant, beside its walk: `per_day` with sd `sd`."""
+
+    per_day: float
+    sd: float
+
+    @property
+    def z(self) -> float:
+        return self.per_day / self.sd
+
+
+@dataclass(frozen=True)
 class LeftOut:
     """A flight that contradicts the others: χ² of what it says against what they expect, of `freedom` combinations."""
 
@@ -76,10 +89,12 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Pooled:
-    """What all flights of a unit say together; the state is constants at the reference temperature, then slopes."""
+    """What all flights of a unit say together; the state is constants at the reference temperature, then slopes, then
+    rates of those that drift steadily, which are as of the last session."""
 
     names: tuple[Name, ...]
     sloped: tuple[int, ...]
+    drifting: tuple[int, ...]
     chain: Chain
     raw: tuple[Known, ...]
     """What each flight says, of the state."""
@@ -90,7 +105,48 @@ class Pooled:
 
     def at(self, day: float | None = None) -> Estimate:
         """Constants and slopes, at the last session unless a day is given."""
-        return self.chain.at(float(self.unit.day[-1]) if day is None else day).estimate()
+        last = float(self.unit.day[-1])
+        known = self.chain.at(last if day is None else day)
+        if self.drifting and day is not None:
+            back = np.eye(len(self.scatter))
+            back[self.drifting, self._rates] = last - day
+            known = Known(back.T @ known.information @ back, back.T @ known.right)
+        return known.estimate()
+
+    @property
+    def _rates(self) -> np.ndarray:
+        """Where the state has the rates of those that drift."""
+        return len(self.names) + len(self.sloped) + np.arange(len(self.drifting))
+
+    def rates(self) -> list[Rate | None]:
+        """What is known of each constant's steady change: of those that drift by the state, of another as if it alone
+        did; None where nothing is."""
+        p, d, last = len(self.names), len(self.scatter), float(self.unit.day[-1])
+        out: list[Rate | None] = [None] * p
+        now = self.at()
+        for place, at in zip(self.drifting, self._rates, strict=True):
+            if np.isfinite(now.covariance[at, at]) and now.covariance[at, at] > 0.0:
+                out[place] = Rate(float(now.state[at]), float(np.sqrt(now.covariance[at, at])))
+        others = [place for place in range(p) if place not in self.drifting]
+        known, none = Known.nothing(d + len(others)), np.zeros(len(others))
+        known.information[:d, :d], known.right[:d] = self.chain.before[0].information, self.chain.before[0].right
+        for k, (day, own) in enumerate(zip(self.chain.day, self.chain.own, strict=True)):
+            if k:
+                gap = self.chain.walk * (day - self.chain.day[k - 1]) + self.chain.jump[k - 1]
+                known = known.loosened(np.r_[gap, none])
+            design = np.hstack([np.eye(d), np.zeros((d, len(others)))])
+            design[others, d + np.arange(len(others))] = day - last
+            known = known + Known(design.T @ own.information @ design, design.T @ own.right)
+        n, g = known.information, known.right
+        size = np.sqrt(np.maximum(np.diagonal(n)[:d], 1e-300))
+        inverse = np.linalg.pinv(n[:d, :d] / np.outer(size, size), rcond=1e-10, hermitian=True)
+        beside = n[d:, :d] / size
+        information = np.diagonal(n)[d:] - np.einsum("ij,jk,ik->i", beside, inverse, beside)
+        right = g[d:] - beside @ inverse @ (g[:d] / size)
+        for i, place in enumerate(others):
+            if information[i] > 1e-9 * n[d + i, d + i]:
+                out[place] = Rate(float(right[i] / information[i]), float(1.0 / np.sqrt(information[i])))
+        return out
 
     def combination(self, place: int, warmth_degc: float = 0.0) -> Array:
         """That of the state (d,) which is constant `place` at a temperature."""
@@ -99,6 +155,23 @@ class Pooled:
         if place in self.sloped:
             out[len(self.names) + self.sloped.index(place)] = warmth_degc
         return out
+
+    def last_z(self) -> Array:
+        """Of each constant (p,): the last session's distance from what all others say of it, in sd; NaN where either
+        says nothing."""
+        last = len(self.unit.day) - 1
+        own = sum((k for k, f in zip(self.raw, self.unit.flights, strict=True) if f.session == last), self._nothing())
+        others = self.chain.others(last).loosened(self.scatter)
+        before, after = others.estimate(), (others + own).estimate()
+        p = len(self.names)
+        variance = np.diagonal(before.covariance)[:p]
+        with np.errstate(invalid="ignore"):
+            gained = variance - np.diagonal(after.covariance)[:p]
+            known = np.isfinite(gained) & (gained > LEAST_SHARE * variance)
+            return np.where(known, (after.state - before.state)[:p] / np.sqrt(np.where(known, gained, 1.0)), np.nan)
+
+    def _nothing(self) -> Known:
+        return Known.nothing(len(self.scatter))
 
     def expected(self, flight: int) -> Known:
         """What all other flights say of the constants as this one met them."""
@@ -130,28 +203,21 @@ Kinds = Mapping[tuple[str, str], Strengths]
 def pool(unit: Unit, kinds: Kinds, *, tested: bool = True) -> Pooled:
     """Smooth a unit's flights; `tested`: look for steps and for flights that contradict the others, the surest first,
     until there is none."""
-    names, sloped = unit.names, tuple(k for k, name in enumerate(unit.names) if name[1] in SLOPED)
-    raw = tuple(state_of(flight, names, sloped, _usual_warmth(unit)) for flight in unit.flights)
-    strengths = [kinds[name[:2]] for name in names]
-    nothing = np.zeros(len(sloped))
-    scatter = np.r_[[s.scatter for s in strengths], nothing]
-    walk = np.r_[[s.walk for s in strengths], nothing]
-    variance = np.array([strengths[k].slope for k in sloped])
-    flat = np.diag(np.r_[np.zeros(len(names)), 1.0 / np.maximum(variance, 1e-300)])
-    first = Known(np.where(flat > 1e290, 0.0, flat), np.zeros(len(flat)))
-    jump = np.zeros((len(unit.day) - 1, len(flat)))
-    found = _smoothed(names, sloped, raw, unit, scatter, walk, jump, first, (), ())
-    freedom = np.array([s.freedom for s in strengths])
+    freedom = np.array([kinds[name[:2]].freedom for name in unit.names])
+    found = _smoothed(unit, kinds, (), (), ())
     while tested:
-        worst, step = _worst_flight(found, freedom), _surest_step(found, freedom)
-        if worst is None and step is None:
+        worst, step, drift = _worst_flight(found, freedom), _surest_step(found, freedom), _surest_drift(found, freedom)
+        surest = min((one[0] for one in (worst, step, drift) if one is not None), default=None)
+        if surest is None:
             break
-        if step is not None and (worst is None or step[0] <= worst[0]):
-            jump[step[1].after - 1, names.index(step[1].name)] = np.inf
-            found = replace(found, steps=(*found.steps, step[1]))
+        steps, left_out, drifting = found.steps, found.left_out, found.drifting
+        if step is not None and step[0] == surest:
+            steps = (*steps, step[1])
+        elif drift is not None and drift[0] == surest:
+            drifting = (*drifting, drift[1])
         elif worst is not None:
-            found = replace(found, left_out=(*found.left_out, worst[1]))
-        found = _smoothed(names, sloped, raw, unit, scatter, walk, jump.copy(), first, found.steps, found.left_out)
+            left_out = (*left_out, worst[1])
+        found = _smoothed(unit, kinds, steps, left_out, drifting)
     return found
 
 
@@ -160,11 +226,19 @@ def _usual_warmth(unit: Unit) -> float:
     return float(np.mean(known)) if known else 0.0
 
 
-def state_of(flight: Flight, names: tuple[Name, ...], sloped: tuple[int, ...], usual_degc: float) -> Known:
-    """A flight's equations as those of the state: the constants at its temperature are constants plus slopes."""
+def state_of(
+    flight: Flight,
+    names: tuple[Name, ...],
+    sloped: tuple[int, ...],
+    usual_degc: float,
+    drifting: tuple[int, ...] = (),
+    days: float = 0.0,
+) -> Known:
+    """A flight's equations as those of the state: the constants at its temperature are constants plus slopes, and
+    `days` after the last session those that drift plus rates."""
     own = flight.equations
     warmth = usual_degc if flight.warmth_degc is None else flight.warmth_degc
-    design = np.zeros((len(own.names), len(names) + len(sloped)))
+    design = np.zeros((len(own.names), len(names) + len(sloped) + len(drifting)))
     for row, name in enumerate(own.names):
         constant = (name[0], OF_SLOPE.get(name[1], name[1]), name[2])
         place = names.index(constant)
@@ -175,22 +249,31 @@ def state_of(flight: Flight, names: tuple[Name, ...], sloped: tuple[int, ...], u
         design[row, place] = 1.0
         if slope is not None:
             design[row, slope] = warmth
+        if place in drifting:
+            design[row, len(names) + len(sloped) + drifting.index(place)] = days
     right = own.right + own.information @ own.reference
     return Known(design.T @ own.information @ design, design.T @ right)
 
 
 def _smoothed(
-    names: tuple[Name, ...],
-    sloped: tuple[int, ...],
-    raw: tuple[Known, ...],
-    unit: Unit,
-    scatter: Array,
-    walk: Array,
-    jump: Array,
-    first: Known,
-    steps: tuple[Step, ...],
-    left_out: tuple[LeftOut, ...],
+    unit: Unit, kinds: Kinds, steps: tuple[Step, ...], left_out: tuple[LeftOut, ...], drifting: tuple[int, ...]
 ) -> Pooled:
+    names, sloped = unit.names, tuple(k for k, name in enumerate(unit.names) if name[1] in SLOPED)
+    usual, last = _usual_warmth(unit), float(unit.day[-1])
+    raw = tuple(
+        state_of(flight, names, sloped, usual, drifting, float(unit.day[flight.session]) - last)
+        for flight in unit.flights
+    )
+    strengths = [kinds[name[:2]] for name in names]
+    nothing = np.zeros(len(sloped) + len(drifting))
+    scatter = np.r_[[s.scatter for s in strengths], nothing]
+    walk = np.r_[[s.walk for s in strengths], nothing]
+    variance = np.array([strengths[k].slope for k in sloped])
+    flat = np.diag(np.r_[np.zeros(len(names)), 1.0 / np.maximum(variance, 1e-300), np.zeros(len(drifting))])
+    first = Known(np.where(flat > 1e290, 0.0, flat), np.zeros(len(flat)))
+    jump = np.zeros((len(unit.day) - 1, len(flat)))
+    for step in steps:
+        jump[step.after - 1, names.index(step.name)] = np.inf
     out = {one.flight for one in left_out}
     sessions = [Known.nothing(len(scatter)) for _ in unit.day]
     for k, flight in enumerate(unit.flights):
@@ -198,7 +281,7 @@ def _smoothed(
             sessions[flight.session] = sessions[flight.session] + raw[k]
     own = [known.loosened(scatter) for known in sessions]
     chain = Chain.of(unit.day, own, walk, jump, first)
-    return Pooled(names, sloped, chain, raw, unit, scatter, steps, left_out)
+    return Pooled(names, sloped, drifting, chain, raw, unit, scatter, steps, left_out)
 
 
 def _worst_flight(found: Pooled, freedom: Array) -> tuple[float, LeftOut] | None:
@@ -263,6 +346,23 @@ def _surest_step(found: Pooled, freedom: Array) -> tuple[float, Step] | None:
     return float(chance[row, i]), Step(found.names[i], boundaries[row], float(size[row, i]), sd, float(z[row, i]))
 
 
+def _surest_drift(found: Pooled, freedom: Array) -> tuple[float, int] | None:
+    """The constant whose steady change is the surest, if one's is and has moved it by more than a session scatters, and
+    the logarithm of its chance."""
+    informed = sum(bool(own.information.any()) for own in found.chain.own)
+    if informed < FEWEST_TO_DRIFT:
+        return None
+    length = float(found.unit.day[-1] - found.unit.day[0])
+    chances = [
+        (float(np.log(2.0) + t_distribution.logsf(abs(rate.z), freedom[place])), place)
+        for place, rate in enumerate(found.rates())
+        if rate is not None and place not in found.drifting
+        if abs(rate.per_day) * length > np.sqrt(found.scatter[place])
+    ]
+    surest = min(chances, default=None)
+    return surest if surest is not None and surest[0] < np.log(FALSE_ALARMS / len(found.names)) else None
+
+
 def jumps(past: Known, future: Known) -> tuple[Array, Array]:
     """Of each element of the state alone: by how much it would have to be more in the future, (d,), and the information
     on that; what past and future do not share is no jump."""
@@ -284,12 +384,18 @@ def strengths(units: Sequence[Unit], *, rounds: int = 2) -> dict[tuple[str, str]
     kinds = _first_strengths(units)
     for _ in range(rounds):
         rows: dict[tuple[str, str], list[Array]] = {kind: [] for kind in kinds}
+        within: dict[tuple[str, str], list[Array]] = {kind: [] for kind in kinds}
         for unit in units:
             found = pool(unit, kinds, tested=False)
-            for name, series in zip(found.names, _series(found), strict=True):
+            for name, series, pairs in zip(found.names, _series(found), _within_sessions(found), strict=True):
                 rows[name[:2]].append(series)
+                within[name[:2]].append(pairs)
         kinds = {
-            kind: strengths_of(Series.of([one for one in own if len(one)]), with_slope=kind[1] in SLOPED)
+            kind: strengths_of(
+                Series.of([one for one in own if len(one)]),
+                with_slope=kind[1] in SLOPED,
+                within=np.concatenate(within[kind]),
+            )
             for kind, own in rows.items()
         }
     return {kind: strengths.coarse() for kind, strengths in kinds.items()}
@@ -333,3 +439,36 @@ def _series(found: Pooled) -> list[Array]:
                 value = (x / v - (x_others * known if known else 0.0)) / information
                 rows[place].append((float(day), warmth_degc, value, 1.0 / information))
     return [np.array(own).reshape(-1, 4) for own in rows]
+
+
+def _within_sessions(found: Pooled) -> list[Array]:
+    """Of each constant (k, 3): how two flights of a session, one after the other, differ in temperature and value, and
+    the variance of that; the other constants as the other sessions and the one flight know them."""
+    pairs: list[list[tuple[float, float, float]]] = [[] for _ in found.names]
+    last: dict[int, tuple[float, Array, Array]] = {}
+    flown = [flight.session for flight in found.unit.flights]
+    for k, flight in enumerate(found.unit.flights):
+        if flight.warmth_degc is None or flown.count(flight.session) < 2:
+            continue
+        others = found.chain.others(flight.session).loosened(found.scatter)
+        before, together = others.estimate(), (others + found.raw[k]).estimate()
+        value, variance = np.full((2, len(found.names)), np.nan)
+        for place in found.sloped:
+            combination = found.combination(place, flight.warmth_degc)
+            (x, v), (x_others, v_others) = together.of(combination), before.of(combination)
+            known = 1.0 / v_others if np.isfinite(v_others) else 0.0
+            if np.isfinite(v) and 1.0 / v - known > LEAST_SHARE / v:
+                variance[place] = 1.0 / (1.0 / v - known)
+                value[place] = (x / v - (x_others * known if known else 0.0)) * variance[place]
+        if flight.session in last:
+            warmth, other, other_variance = last[flight.session]
+            for at in np.flatnonzero(np.isfinite(value) & np.isfinite(other)):
+                pairs[at].append(
+                    (
+                        flight.warmth_degc - warmth,
+                        float(value[at] - other[at]),
+                        float(variance[at] + other_variance[at]),
+                    )
+                )
+        last[flight.session] = flight.warmth_degc, value, variance
+    return [np.array(own).reshape(-1, 3) for own in pairs]

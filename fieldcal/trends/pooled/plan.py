@@ -28,8 +28,9 @@ from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.simulation.experiment import Experiment, simulate
 from fieldcal.stages.composition import ORIGIN
 from fieldcal.stages.tables import AXES
+from fieldcal.trends.pooled.present import information_that_counts
 from fieldcal.trends.pooled.rows import limit_of, strengths_told, words_of
-from fieldcal.trends.pooled.table import information_that_counts, near
+from fieldcal.trends.pooled.table import near
 from fieldcal.trends.pooled.units import HistoryUnit, by_unit, unit_of
 from fieldcal.warehouse.questions import existing, known_vehicle
 
@@ -106,10 +107,11 @@ def plan(root: Path, vehicle_id: str) -> Plan:
             f"No two flights of {vehicle_id!r} have information yet: fly 60° either way about every axis.",
         )
     now = table.sort("started_at", "flight_id", nulls_last=False)["pooled_with"][-1]
-    rows = information_that_counts(root).filter(pl.col("unit_id") == now)
+    information, _ = information_that_counts(root)
+    rows = information.filter(pl.col("unit_id") == now)
     one = unit_of(by_unit(rows)[0])
     with one_thread():
-        found = near(one, strengths_told(table.filter(pl.col("pooled_with") == now), one))
+        found, _ = near(one, strengths_told(table.filter(pl.col("pooled_with") == now), one))
         axes = _axes(warehouse.scan("run", vehicle_id=vehicle_id))
         dip_rad = _dip(warehouse.scan("calibration", vehicle_id=vehicle_id))
         about = [turned for n in (1, 2, 3) for turned in combinations(range(3), n)]
@@ -155,7 +157,7 @@ def _manoeuvre(
     flown = _in_sensor_axes(flown, axes, polarity)
     flown = flown.of([name for name in flown.names if name in found.names])
     warm = one.unit.flights[-1].warmth_degc
-    own = state_of(Flight(flown, 0, warm), found.names, found.sloped, 0.0)
+    own = state_of(Flight(flown, 0, warm), found.names, found.sloped, 0.0, found.drifting)
     now = found.chain.at(float(one.unit.day[-1]))
     after = now + Known(own.information, np.zeros(len(own.right))).loosened(found.scatter)
     before, later = now.estimate(), after.estimate()

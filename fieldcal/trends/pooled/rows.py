@@ -22,6 +22,9 @@ from fieldcal.trends.pooled.units import DAY, EPOCH, HistoryUnit
 
 INFORMED_SHARE = 0.5
 """Of what is known of a zero before any flight: one that is not known better is refused, as a flight's is."""
+TELLS = 1e-3
+"""Share of what is known of a constant from which on a flight is one of those that tell it: others do so by what they
+know of other constants."""
 FIELD_T = 5e-5
 """The earth's field, about."""
 TURN = "Turn it 60° either way about the sensor's {axis} axis, several times."
@@ -29,9 +32,10 @@ TILT = "Turn it over, so that the sensor's {axis} axis points up, down and level
 Row = dict[str, object]
 
 
-def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds, day: float | None = None) -> list[Row]:
+def rows_of_unit(one: HistoryUnit, found: Pooled, distance: Array, kinds: Kinds, day: float | None = None) -> list[Row]:
     """Rows of each constant, at the last session unless a `day` since EPOCH is given; of a unit whose flights say
-    nothing none."""
+    nothing none. `distance` (n,): of each flight's reference point from the pooled one, over that up to which its
+    equations hold."""
     if not any(own.information.any() for own in found.raw):
         return []
     now = found.at(day)
@@ -39,7 +43,7 @@ def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds, day: float | Non
     sessions = {flight.session for k, flight in enumerate(found.unit.flights) if k not in out}
     unconfirmed = bool(out) and len(found.unit.day) - 1 not in sessions
     left_out = [one.flight_ids[k] for k in sorted(out)]
-    shares = found.contributions()
+    shares, rates, last_z = found.contributions(), found.rates(), found.last_z()
     factor, value, covariance = _in_history(one, found, now)
     degc = _best_degc(found, now, one.temperatures_degc)
     rows: list[Row] = []
@@ -48,6 +52,11 @@ def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds, day: float | Non
         size = abs(factor[place])
         refusal = _refusal(found, now, place, name, degc[place], one)
         status, code, reason = Status.OK.value, None, _sentence(found, place, shares[:, place], left_out)
+        if reason and (far := int(np.sum(distance > 1.0))):
+            reason += (
+                f" {far} left out: made at scales up to {distance.max():.1f} times as far from these as they hold. "
+                "Calibrate their logs again."
+            )
         step = next((s for s in reversed(found.steps) if s.name == name), None)
         if refusal:
             status, code, reason = Status.REFUSED.value, ReasonCode.SCALE_UNCERTAIN.value, refusal
@@ -59,6 +68,9 @@ def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds, day: float | Non
             )
         elif step is not None:
             status = DriftStatus.STEP.value
+        elif place in found.drifting:
+            status = DriftStatus.DRIFTING.value
+        rate = rates[place] if one.last["started_at"] is not None else None
         slope = found.sloped.index(place) + len(found.names) if place in found.sloped else None
         known = bool(np.isfinite(now.covariance[place, place]))
         sloped = slope is not None and bool(np.isfinite(now.covariance[slope, slope]))
@@ -74,6 +86,9 @@ def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds, day: float | Non
             "sd": float(np.sqrt(covariance[place, place])) if known else None,
             "slope_per_degc": float(factor[place] * now.state[slope]) if sloped and known else None,
             "slope_per_degc_sd": float(size * np.sqrt(now.covariance[slope, slope])) if sloped and known else None,
+            "slope_per_day": float(factor[place] * rate.per_day) if rate is not None and known else None,
+            "slope_per_day_sd": float(size * rate.sd) if rate is not None and known else None,
+            "last_z": float(np.sign(factor[place]) * last_z[place]) if np.isfinite(last_z[place]) else None,
             "best_known_degc": degc[place] if known else None,
             "temperature_min_degc": None if one.temperatures_degc is None else one.temperatures_degc[0],
             "temperature_max_degc": None if one.temperatures_degc is None else one.temperatures_degc[1],
@@ -81,8 +96,8 @@ def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds, day: float | Non
             "walk_per_sqrt_day": size * float(np.sqrt(strength.walk)) if known else None,
             "slope_spread": size * float(np.sqrt(strength.slope)) if sloped and known else None,
             "n_innovations": float(strength.freedom),
-            "n_flights": int(np.sum(shares[:, place] > 0.0)),
-            "n_sessions": len({f.session for k, f in enumerate(found.unit.flights) if shares[k, place] > 0.0}),
+            "n_flights": int(np.sum(shares[:, place] > TELLS)),
+            "n_sessions": len({f.session for k, f in enumerate(found.unit.flights) if shares[k, place] > TELLS}),
             "change_at": None if step is None else _moment(found.unit.day[step.after], one),
             "change_size": None if step is None else float(factor[place] * step.size),
             "change_size_sd": None if step is None else float(size * step.sd),
@@ -92,6 +107,7 @@ def rows_of_unit(one: HistoryUnit, found: Pooled, kinds: Kinds, day: float | Non
             "flights": list(one.flight_ids),
             "shares": [float(v) for v in shares[:, place]],
             "left_out": left_out,
+            "distances": [float(v) for v in distance],
             "status": status,
             "reason_code": code,
             "reason": reason,
@@ -205,14 +221,16 @@ def words_of(name: Name) -> str:
 
 def _sentence(found: Pooled, place: int, shares: Array, left_out: list[str]) -> str:
     """What the value is from."""
-    flights = int(np.sum(shares > 0.0))
-    sessions = len({flight.session for k, flight in enumerate(found.unit.flights) if shares[k] > 0.0})
+    flights = int(np.sum(shares > TELLS))
+    sessions = len({flight.session for k, flight in enumerate(found.unit.flights) if shares[k] > TELLS})
     text = f"What {flights} flights in {sessions} sessions know together."
     if left_out:
         text += f" {len(left_out)} that contradict the others are left out."
     for step in found.steps:
         if step.name == found.names[place]:
             text += f" It stepped by {abs(step.z):.0f} sd; earlier flights tell no more of it."
+    if place in found.drifting and (rate := found.rates()[place]) is not None:
+        text += f" It drifts steadily, {abs(rate.z):.0f} sd from not at all."
     return text
 
 

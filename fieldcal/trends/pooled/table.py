@@ -13,13 +13,15 @@ import polars as pl
 
 from fieldcal.estimation.pooled.unit import Kinds, Pooled, Unit, pool, strengths
 from fieldcal.flight.threads import one_thread
+from fieldcal.geometry.rotation import Array
+from fieldcal.names import Status
 from fieldcal.provenance.run_key import run_key, source_digest
 from fieldcal.schemas import TABLES, table_key
+from fieldcal.trends.one_sensor import told
 from fieldcal.trends.pooled.memory import Memory
+from fieldcal.trends.pooled.present import information_that_counts
 from fieldcal.trends.pooled.rows import rows_of_unit, strengths_told
-from fieldcal.trends.pooled.units import DAY, EPOCH, HistoryUnit, by_unit, sessions_flown, unit_of
-from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.decisions.withdrawn import counting
+from fieldcal.trends.pooled.units import DAY, EPOCH, HistoryUnit, by_unit, first_that_tell, sessions_flown, unit_of
 from fieldcal.warehouse.layout import history_files
 from fieldcal.warehouse.publish import publish
 from fieldcal.warehouse.store import empty_frame, read_table
@@ -28,8 +30,8 @@ KEY = list(table_key("pooled"))
 MOST_UNITS = 40
 """Whose flights tell how much constants move: more hardly tell it better."""
 FAR = 0.1
-"""Relative distance of the gain at which a flight was linearised from the pooled one: beyond it the flight's equations
-are not those of this unit, and it is left out."""
+"""Relative distance of the gain at which a flight was linearised from the pooled one up to which its equations hold: a
+flight beyond it is left out and told, until its log is calibrated again."""
 INFORMED = 1e-6
 """Share of the pooled information on a gain from which on a flight's own reference matters."""
 
@@ -54,12 +56,8 @@ def update_pooled(root: Path) -> tuple[str, ...]:
 
 def pooled_table(root: Path, memory: Memory | None = None) -> pl.DataFrame:
     """The table `pooled` as the history has it now; nothing is written."""
-    return table_of(information_that_counts(root), memory)
-
-
-def information_that_counts(root: Path) -> pl.DataFrame:
-    """Rows of `information` of flights that nobody withdrew."""
-    return Warehouse(root).scan("information").filter(counting(root)).collect()
+    information, exchanged = information_that_counts(root)
+    return told(table_of(information, memory), exchanged, (Status.OK,))
 
 
 def table_of(information: pl.DataFrame, memory: Memory | None = None) -> pl.DataFrame:
@@ -68,7 +66,10 @@ def table_of(information: pl.DataFrame, memory: Memory | None = None) -> pl.Data
     if not units:
         return empty_frame("pooled")
     # By powers of two, so that the next flight of one does not make others tell.
-    telling = sorted(units, key=lambda unit: -sessions_flown(unit).bit_length())[:MOST_UNITS]
+    telling = [
+        first_that_tell(unit)
+        for unit in sorted(units, key=lambda unit: -sessions_flown(unit).bit_length())[:MOST_UNITS]
+    ]
     with one_thread():
         kinds = memory.kinds(telling, lambda: kinds_of(telling))
         rows = [memory.rows(unit, kinds, partial(rows_of, unit, kinds)) for unit in units]
@@ -87,7 +88,7 @@ def table_then(root: Path, table: pl.DataFrame, moment: datetime) -> pl.DataFram
 
     Rows of units that no flight of which has a date are left out: nobody knows what they were when."""
     day = ((moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - EPOCH) / DAY
-    information = information_that_counts(root)
+    information, exchanged = information_that_counts(root)
     out = [empty_frame("pooled")]
     for (unit_id,), own in table.group_by("pooled_with", maintain_order=True):
         one = unit_of(by_unit(information.filter(pl.col("unit_id") == unit_id))[0])
@@ -95,9 +96,9 @@ def table_then(root: Path, table: pl.DataFrame, moment: datetime) -> pl.DataFram
             continue
         kinds = strengths_told(own, one)
         with one_thread():
-            rows = pl.DataFrame(rows_of_unit(one, near(one, kinds), kinds, day), schema=out[0].schema)
+            rows = pl.DataFrame(rows_of_unit(one, *near(one, kinds), kinds, day), schema=out[0].schema)
         out.append(rows.join(own.select(KEY), on=KEY, how="semi"))
-    return pl.concat(out).sort(KEY)
+    return told(pl.concat(out), exchanged, (Status.OK,)).sort(KEY)
 
 
 def kinds_of(units: Sequence[pl.DataFrame]) -> Kinds:
@@ -108,27 +109,34 @@ def kinds_of(units: Sequence[pl.DataFrame]) -> Kinds:
 def rows_of(unit: pl.DataFrame, kinds: Kinds) -> pl.DataFrame:
     """Rows of the table `pooled`, of the unit of these rows of `information`."""
     one = unit_of(unit)
-    return pl.DataFrame(rows_of_unit(one, near(one, kinds), kinds), schema=empty_frame("pooled").schema)
+    return pl.DataFrame(rows_of_unit(one, *near(one, kinds), kinds), schema=empty_frame("pooled").schema)
 
 
-def near(one: HistoryUnit, kinds: Kinds) -> Pooled:
-    """The unit pooled, without flights that were linearised too far from what it is."""
+def near(one: HistoryUnit, kinds: Kinds) -> tuple[Pooled, Array]:
+    """(the unit pooled without flights whose equations were made too far from what it is, how far each flight's (n,)
+    were: the largest distance of a gain over that up to which they hold, 0 where they tell no gain)."""
     found = pool(one.unit, kinds)
-    now = found.at().state
-    far = set()
+    far = distances(one, found)
+    if not (far > 1.0).any() or (far > 1.0).all():
+        return found, far
+    silent = [
+        replace(flight, equations=flight.equations.of(())) if far[k] > 1.0 else flight
+        for k, flight in enumerate(one.unit.flights)
+    ]
+    return pool(Unit(tuple(silent), one.unit.day), kinds), far
+
+
+def distances(one: HistoryUnit, found: Pooled) -> Array:
+    """Of each flight (n,): the largest relative distance of a gain that it tells from the pooled one, over `FAR`."""
+    known = found.chain.at(float(one.unit.day[-1]))
+    now, information = known.estimate().state, np.diagonal(known.information)
+    out = np.zeros(len(one.unit.flights))
     for k, flight in enumerate(one.unit.flights):
         own = flight.equations
         for i, name in enumerate(own.names):
             if name[1] != "gain":
                 continue
-            gain = now[found.names.index(name)]
-            heard = own.information[i, i] > INFORMED * found.chain.at(float(one.unit.day[-1])).information[i, i]
-            if np.isfinite(gain) and heard and abs(own.reference[i] - gain) > FAR * abs(gain):
-                far.add(k)
-    if not far or len(far) == len(one.unit.flights):
-        return found
-    silent = [
-        replace(flight, equations=flight.equations.of(())) if k in far else flight
-        for k, flight in enumerate(one.unit.flights)
-    ]
-    return pool(Unit(tuple(silent), one.unit.day), kinds)
+            place = found.names.index(name)
+            if np.isfinite(now[place]) and own.information[i, i] > INFORMED * information[place]:
+                out[k] = max(out[k], abs(own.reference[i] - now[place]) / (FAR * abs(now[place])))
+    return out

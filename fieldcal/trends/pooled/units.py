@@ -20,7 +20,7 @@ from fieldcal.schemas.rows import InformationRow
 from fieldcal.words.rows import typed
 
 EPOCH, DAY = datetime(1970, 1, 1, tzinfo=UTC), timedelta(days=1)
-FEWEST_FLIGHTS = 2
+FEWEST_FLIGHTS, MANY_SESSIONS = 2, 32
 LEAST_OFTEN = 0.5
 """Share of its flights that a parameter beside gain and zero has to be in: what only some have is eliminated."""
 BY_GAIN = ("gain", "zero", "zero_per_degc", "g_sensitivity")
@@ -60,6 +60,16 @@ def by_unit(rows: pl.DataFrame) -> list[pl.DataFrame]:
 def sessions_flown(rows: pl.DataFrame) -> int:
     """In how many sessions a unit flew."""
     return rows.select("vehicle_id", "session_id").n_unique()
+
+
+def first_that_tell(rows: pl.DataFrame) -> pl.DataFrame:
+    """Of a frame of `by_unit` the first sessions that say how much constants move: all where there are few, else a
+    power of two, so that the next flight leaves what they say as it is."""
+    enough = 1 << (sessions_flown(rows).bit_length() - 1)
+    if enough < MANY_SESSIONS:
+        return rows
+    first = rows.select("vehicle_id", "session_id").unique(maintain_order=True).head(enough)
+    return rows.join(first, on=["vehicle_id", "session_id"], how="semi", maintain_order="left")
 
 
 def unit_of(rows: pl.DataFrame) -> HistoryUnit:

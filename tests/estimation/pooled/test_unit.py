@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pooled import NAMES, SCATTER, Truth, alarms, drawn, of_names
+from pooled import NAMES, PER_DEGC, SCATTER, Truth, alarms, drawn, of_names
 
 from fieldcal.estimation.normal_equations import NormalEquations
 from fieldcal.estimation.pooled.chain import Known
 from fieldcal.estimation.pooled.strengths import Series, Strengths, innovations, strengths_of
-from fieldcal.estimation.pooled.unit import Flight, Kinds, Unit, contradiction, pool
+from fieldcal.estimation.pooled.unit import Flight, Kinds, Unit, contradiction, pool, strengths
 
 SESSIONS = 12
 KNOWN: Kinds = {
@@ -49,6 +49,68 @@ def test_a_step_of_ten_scatters_is_found_in_its_session_and_named() -> None:
         size = 10.0 * SCATTER[NAMES[place][:2]]
         assert abs(found.steps[0].size - size) < 5.0 * found.steps[0].sd
         assert not found.left_out
+
+
+def moving(unit: Unit, place: int, per_day: float) -> Unit:
+    """A unit one constant of which moves steadily."""
+    flights = []
+    for flight in unit.flights:
+        own = flight.equations
+        by = per_day * unit.day[flight.session] * (np.arange(18) == place)
+        flights.append(replace(flight, equations=replace(own, right=own.right + own.information @ by)))
+    return replace(unit, flights=tuple(flights))
+
+
+def test_a_steady_drift_is_named_with_its_rate_and_is_no_step() -> None:
+    """A scatter and a half a session, of sessions five days apart in the mean: one in twenty may look like a step."""
+    named, z = 0, []
+    for place in range(18):
+        rng = np.random.default_rng([9, place])
+        unit = drawn(rng, SESSIONS, seen=14)
+        truth = Truth(np.random.default_rng([9, place]), SESSIONS)
+        rate = 0.3 * SCATTER[NAMES[place][:2]]
+        found = pool(moving(unit, place, rate), KNOWN)
+        if found.steps or [found.names[i] for i in found.drifting] != [NAMES[place]]:
+            continue
+        named += 1
+        (i,) = found.drifting
+        told = found.rates()[i]
+        assert told is not None
+        z.append((told.per_day - rate) / told.sd)
+        for session in (0, SESSIONS // 2, SESSIONS - 1):
+            then = found.at(float(unit.day[session]))
+            true = truth.walked[session, place] + rate * unit.day[session]
+            assert abs(then.state[i] - true) < 4.5 * np.sqrt(then.covariance[i, i])
+    assert named >= 16
+    assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.4
+
+
+def test_what_does_not_move_has_rates_within_their_sd_and_none_is_named() -> None:
+    z = []
+    for seed in range(8):
+        found = pool(drawn(np.random.default_rng([11, seed]), SESSIONS, seen=14), KNOWN)
+        assert not found.drifting
+        z += [rate.z for rate in found.rates() if rate is not None]
+    assert len(z) == 8 * 18
+    assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.25
+
+
+def test_one_rate_among_others_is_least_squares() -> None:
+    """Of a constant that all sessions show alone, without walk or temperature: the slope of a straight line."""
+    name, rng = ("gyroscope", "lever", "x"), np.random.default_rng(3)
+    day, value = np.arange(9.0) * 4.0, rng.normal(size=9)
+    one = [
+        Flight(NormalEquations((name,), np.zeros(1), np.array([v]), np.eye(1)), k, None) for k, v in enumerate(value)
+    ]
+    found = pool(Unit(tuple(one), day), {name[:2]: Strengths(0.0, 0.5, 0.0)}, tested=False)
+    (rate,) = found.rates()
+    (slope, _), covariance = np.polyfit(day, value, 1, cov="unscaled")
+    assert rate is not None
+    assert rate.per_day == pytest.approx(slope)
+    assert rate.sd == pytest.approx(np.sqrt(1.5 * covariance[0, 0]))
+    z = found.last_z()[0]
+    off = value[-1] - value[:-1].mean()
+    assert z == pytest.approx(off / np.sqrt(1.5 + 1.5 / 8), rel=1e-6)
 
 
 def spoiled(unit: Unit, flight: int) -> Unit:
@@ -133,6 +195,41 @@ def test_strengths_are_found_where_there_is_enough_to_tell() -> None:
     for name in ("walk", "scatter", "slope"):
         assert 0.6 < getattr(found, name) / getattr(true, name) < 1.7, name
     assert found.freedom > 60 * 20
+
+
+@pytest.mark.parametrize("sessions", [3, 12])
+@pytest.mark.parametrize("own_sd", [0.02, 0.3])
+def test_strengths_are_found_where_sessions_are_known_far_better_than_they_scatter(
+    own_sd: float, sessions: int
+) -> None:
+    """Were every innovation taken for a restart, the scatter would be half of `own_sd`."""
+    true = Strengths(1e-3, 1.0, 4e-3)
+    found = strengths_of(drawn_series(np.random.default_rng(6), true, own_sd, 18, sessions))
+    assert 0.5 < found.scatter < 2.5
+    assert found.walk < 0.2, "what may be either is scatter"
+
+
+def test_flights_of_a_session_tell_slopes_that_its_scatter_hides() -> None:
+    """Two a session at other temperatures, known a hundred times better than sessions scatter; none is left out."""
+    units = []
+    for number in range(4):
+        rng = np.random.default_rng([21, number])
+        truth = Truth(rng, 6)
+        flights = []
+        for k in range(12):
+            degc = float(rng.uniform(5.0, 35.0))
+            sd = 0.01 * of_names(SCATTER)
+            reading = truth.of_flight(k // 2, degc) + sd * rng.normal(size=18)
+            information = np.diag(sd**-2)
+            flights.append(
+                Flight(NormalEquations(NAMES, np.zeros(18), information @ reading, information), k // 2, degc - 25.0)
+            )
+        units.append(Unit(tuple(flights), truth.day))
+    kinds = strengths(units)
+    for kind in SCATTER:
+        assert 0.5 < np.sqrt(kinds[kind].slope) / PER_DEGC[kind] < 2.0, kind
+        assert 0.6 < np.sqrt(kinds[kind].scatter) / SCATTER[kind] < 1.6, kind
+    assert not any(found.left_out or found.steps for found in (pool(unit, kinds) for unit in units))
 
 
 def test_innovations_of_the_right_strengths_are_white() -> None:
