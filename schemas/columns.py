@@ -321,8 +321,8 @@ DISTANCES = Column(
     "distances",
     pa.list_(_F64),
     "1",
-    "by flights: distance of the scales at which its equations were made from the pooled ones, over that up to which they "
-    "hold; beyond 1 it is left out",
+    "by flights: distance of the scales at which its equations were made from the pooled ones, over that up to which "
+    "they hold; beyond 1 it is left out",
 )
 LEFT_OUT = Column("left_out", pa.list_(_TEXT), "", "flight_id of each flight that contradicts the others, left out")
 
@@ -357,7 +357,8 @@ STATUS = Column(
     _TEXT,
     "",
     "outcome: ok, refused, absent, failed, or withdrawn by a decision (`drift`: stable, drifting, step, outlier, "
-    "insufficient; `pooled`: ok, step, drifting, refused, or insufficient where the last session contradicts the others)",
+    "insufficient; `pooled`: ok, step, drifting, refused, or insufficient where the last session contradicts the "
+    "others)",
 )
 
 # --- run
@@ -395,7 +396,8 @@ LAST_Z = Column(
     "last_z",
     _F64,
     "1",
-    "distance of the last flight from the regression (`pooled`: of the last session from all others), in standard deviations",
+    "distance of the last flight from the regression (`pooled`: of the last session from all others), in standard "
+    "deviations",
 )
 CHANGE_AT = Column(
     "change_at",
