@@ -13,6 +13,7 @@ from fieldcal.batch.elsewhere.work import FarAnswer, take_in
 from fieldcal.errors import FieldcalError
 from fieldcal.flows.runners import Answers
 from fieldcal.flows.tasks import unseen
+from fieldcal.words.talk import say
 
 FarAnswers = Iterator[tuple[Batch, FarAnswer | Exception]]
 """Each input with what came back, in the order in which they end."""
@@ -25,6 +26,8 @@ def taken_in(far_answers: FarAnswers) -> Answers:
         if isinstance(far_answer, Exception):
             answer = far_answer
         else:
+            for line in far_answer["logged"]:
+                say(f"Worker {far_answer['worker']}: {line}")
             try:
                 answer = _taken_in(Path(given["root"]), given["number"], far_answer)
             except Exception as error:

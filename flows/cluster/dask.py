@@ -18,6 +18,7 @@ from fieldcal.errors import FieldcalError
 from fieldcal.flows.cluster.answers import FarAnswers
 from fieldcal.flows.runners import scheduler_client
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.words.talk import say
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -58,6 +59,8 @@ def check_versions(client: Client) -> None:
     """
     ours = made_by()
     told: Mapping[str, object] = client.run(made_by, on_error="return")
+    if not told:
+        say("The scheduler has no workers yet; the night waits for them.")
     for worker, theirs in sorted(told.items()):
         if not isinstance(theirs, dict):
             what = f"Worker {worker} does not run this fieldcal ({type(theirs).__name__}: {theirs}): install it there."

@@ -1,8 +1,8 @@
 """What another machine computed, by way of the store: readings as objects that a head will name, all else in one pack.
 
 Readings are most of the bytes. They go where they stay, and the machine that publishes them is told their names; it
-never has them. A pack has what the stages left behind, and is put into that machine's own cache of stages, as if they
-had run there. Packs lie under `handed-over/` and go when they were taken, or with other garbage.
+need not have them. A pack has what the stages left behind, and is put into that machine's own cache of stages, as if
+they had run there. Packs lie under `handed-over/` and go when they were taken, or with other garbage.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TypedDict
 
 from fieldcal.batch.documents import Answer, Batch, PlainOutcome
+from fieldcal.batch.elsewhere.heard import heard
 from fieldcal.batch.elsewhere.own_root import own_root
 from fieldcal.batch.elsewhere.same import difference, made_by, this_worker
 from fieldcal.batch.flights import Round, flights, take
@@ -43,11 +44,13 @@ class FarBatch(TypedDict):
 
 
 class FarAnswer(TypedDict):
-    """`answer`, of which `handed` has the results; None where they lie in a folder that all share."""
+    """`answer`, of which `handed` has the results; None where they lie in a folder that all share. `logged`: what the
+    night has to say of the worker."""
 
     answer: Answer
     handed: HandedOver | None
     worker: str
+    logged: list[str]
 
 
 def is_far(archive: Path, root: Path) -> bool:
@@ -69,21 +72,27 @@ def work(given: FarBatch, do: Round = take) -> FarAnswer:
     What concerns every log is told in the answer: other versions than the night's, a store that refuses.
     """
     worker = this_worker()
+    handed: HandedOver | None = None
     other = difference(worker, made_by(), given["made_by"])
-    if other is not None:
-        return {"answer": _refused(ReasonCode.CODE_CHANGED, other), "handed": None, "worker": worker}
-    try:
-        jobs = [_arrived(job, given["logs"]) for job in given["jobs"]]
-        if not is_url(given["root"]):
-            answer = flights(given["root"], given["source"], jobs, given["code"], do, watched=True)
-            return {"answer": _as_asked(answer, given["jobs"]), "handed": None, "worker": worker}
-        with own_root() as root:
-            answer = flights(str(root), given["source"], jobs, given["code"], do, watched=True)
-            handed = hand_over(Objects(given["root"]), root) if answer["error"] is None else None
-            return {"answer": _as_asked(answer, given["jobs"]), "handed": handed, "worker": worker}
-    except RemoteError as error:
-        told = _refused(error.reason_code, f"{error.sentence} (Told by worker {worker}.)")
-        return {"answer": told, "handed": None, "worker": worker}
+    with heard() as lines:
+        try:
+            if other is not None:
+                answer = _refused(ReasonCode.CODE_CHANGED, other)
+            else:
+                answer, handed = _worked(given, do)
+        except RemoteError as error:
+            answer = _refused(error.reason_code, f"{error.sentence} (Told by worker {worker}.)")
+    return {"answer": answer, "handed": handed, "worker": worker, "logged": lines}
+
+
+def _worked(given: FarBatch, do: Round) -> tuple[Answer, HandedOver | None]:
+    jobs = [_arrived(job, given["logs"]) for job in given["jobs"]]
+    if not is_url(given["root"]):
+        return _as_asked(flights(given["root"], given["source"], jobs, given["code"], do, watched=True), given), None
+    with own_root() as root:
+        answer = flights(str(root), given["source"], jobs, given["code"], do, watched=True)
+        handed = hand_over(Objects(given["root"]), root) if answer["error"] is None else None
+        return _as_asked(answer, given), handed
 
 
 def take_in(root: Path, answer: FarAnswer) -> Answer:
@@ -121,8 +130,8 @@ def _arrived(plain: PlainJob, logs: Mapping[str, SentLog]) -> PlainJob:
     return job.plain()
 
 
-def _as_asked(answer: Answer, jobs: list[PlainJob]) -> Answer:
+def _as_asked(answer: Answer, given: FarBatch) -> Answer:
     """The answer about the logs as the night knows them: where they lie on its own machine."""
-    asked = {job["flight_id"]: job for job in jobs}
+    asked = {job["flight_id"]: job for job in given["jobs"]}
     outcomes: list[PlainOutcome] = [{**one, "job": asked[one["job"]["flight_id"]]} for one in answer["outcomes"]]
     return {"outcomes": outcomes, "error": answer["error"]}
