@@ -320,12 +320,13 @@ def plan(root: Path) -> None:
     configuration = parse("", None)
     remembered(root)
     with timed("a night's plan: what it remembers of logs"):
-        logs = read_ledger(root)
+        read_ledger(root)
     with timed("a night's plan: which logs the history knows"):
         known, _ = _known(root, root / "no-archive")
     with timed("a night's plan: what it remembers of flights"):
         ledger = Ledger(root, configuration)
-    assert len(ledger._flights) == len(known)
+        for vehicle in sorted({str(uri).partition("/")[0] for uri in known.values()}):
+            ledger._of_flights(vehicle)
 
 
 def remembered(root: Path) -> None:
@@ -345,10 +346,17 @@ def remembered(root: Path) -> None:
         ]
         signals = [f"signals/{s}/vehicle_id={vehicle}/{flight_id}.parquet" for s in ("imu", "magnetometer", "vps")]
         digest = hashlib.sha256(uri.encode()).hexdigest()
-        flights[flight_id] = {"of": digest, "files": steps + signals, "as_they_were": digest, "entry": entry}
+        flights.setdefault(vehicle, {})[flight_id] = {
+            "of": digest,
+            "files": steps + signals,
+            "as_they_were": digest,
+            "entry": entry,
+        }
     (root / "night").mkdir(exist_ok=True)
     (root / "night" / "logs.json").write_bytes(seal({"logs": places}))
-    (root / "night" / "seen.json").write_bytes(seal({"flights": flights, "histories": {}}))
+    (root / "night" / "seen").mkdir(exist_ok=True)
+    for vehicle, own in flights.items():
+        (root / "night" / "seen" / f"{vehicle}.json").write_bytes(seal({"flights": own, "history": ""}))
 
 
 LINES: dict[str, Callable[[Path], None]] = {

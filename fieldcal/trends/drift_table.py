@@ -149,7 +149,8 @@ def trends_of(
         trends = trends if curves is None else curves.widened(trends)
     rows = _with_curves(rows, curves)
     # A flight set aside is not what the line is as of.
-    last = numbered.filter(pl.Series(trends.kept)).group_by("row").agg(as_of=pl.col("started_at").last())
+    kept_at = numbered.select("row", "started_at").filter(pl.Series(trends.kept))
+    last = kept_at.group_by("row").agg(as_of=pl.col("started_at").last())
     rows = rows.join(last, on="row", how="left", maintain_order="left")
     stepped, drifting = regression.moving(trends)
     steady = (trends.n_sessions >= ENOUGH_SESSIONS) & ~stepped & ~drifting
