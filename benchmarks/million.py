@@ -318,7 +318,7 @@ def plan(root: Path) -> None:
     from fieldcal.config.configuration import parse
 
     configuration = parse("", None)
-    remembered(root)
+    subprocess.run([sys.executable, __file__, "line", str(root), "remembered"], check=True)
     with timed("a night's plan: what it remembers of logs"):
         read_ledger(root)
     with timed("a night's plan: which logs the history knows"):
@@ -370,7 +370,8 @@ LINES: dict[str, Callable[[Path], None]] = {
 
 @contextmanager
 def timed(what: str) -> Iterator[None]:
-    """Say how long it took: elapsed, of the processor (children too), and the largest size of this process so far."""
+    """Say how long it took, elapsed and of the processor (of children that ended too), and the largest size of this
+    process so far; SQL runs in another, whose size is limited."""
     began, cpu = time.perf_counter(), _cpu()
     yield
     told = {"what": what, "s": time.perf_counter() - began, "cpu_s": _cpu() - cpu, "gb": _peak_gb()}
@@ -384,9 +385,7 @@ def _cpu() -> float:
 
 
 def _peak_gb() -> float:
-    return (
-        max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) * 1024 / 1e9
-    )
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
 
 
 def measure(root: Path, only: list[str]) -> None:
@@ -431,7 +430,7 @@ def main() -> None:
     elif given.command == "measure":
         measure(root, given.only)
     else:
-        LINES[given.other](root)
+        {**LINES, "remembered": remembered}[given.other](root)
 
 
 if __name__ == "__main__":
