@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from datetime import datetime
+from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from prefect import Flow, flow
 from prefect.states import Failed
 
 from fieldcal.batch.closing import close_night
 from fieldcal.batch.documents import Answer, Batch, NightDocument, PlainOutcome
+from fieldcal.batch.elsewhere.work import is_far, work
 from fieldcal.batch.flights import lost
 from fieldcal.batch.ledgers.room import make_room
 from fieldcal.batch.night import Night, Watcher, plan_night, publishings
@@ -21,11 +23,13 @@ from fieldcal.config.find import Source
 from fieldcal.flight.job import PlainJob
 from fieldcal.flows.alive import alive
 from fieldcal.flows.artifact import keep_artifact, tell_prefect
+from fieldcal.flows.cluster.answers import taken_in
+from fieldcal.flows.cluster.dask import far_dask_answers
 from fieldcal.flows.farewell import tell_while_heard
-from fieldcal.flows.pool import hand_over, pool_answers
+from fieldcal.flows.pool import beating, far_pool_answers, hand_over, pool_answers
 from fieldcal.flows.processes import Processes, process_answers
 from fieldcal.flows.runners import Answers, Parallel, batches, dask_answers
-from fieldcal.flows.tasks import publish_as_task, run_batch
+from fieldcal.flows.tasks import publish_as_task, run_batch, stage_as_task
 from fieldcal.names import Status
 from fieldcal.provenance.run_key import code_digest
 from fieldcal.reason_codes import ReasonCode
@@ -89,11 +93,25 @@ def session(
 
 @flow(name="batch", persist_result=False, validate_parameters=False)
 def batch(
-    number: int, root: str, source: Source, jobs: list[dict[str, PlainValue]], code: str, handed_over: str
+    number: int,
+    root: str,
+    source: Source,
+    jobs: list[dict[str, PlainValue]],
+    code: str,
+    handed_over: str,
+    logs: dict[str, Any] | None = None,
+    made_by: dict[str, str] | None = None,
 ) -> None:
-    """A batch in a flow run of its own, in a work pool; its answer is handed over as a file of the warehouse."""
-    with alive(Path(root)):
-        hand_over(Path(root), handed_over, run_batch(number, root, source, cast(list[PlainJob], jobs), code))
+    """A batch in a flow run of its own, in a work pool; its answer is handed over through the warehouse. With `logs` it
+    is a `FarBatch`."""
+    given: Batch = {"number": number, "root": root, "source": source, "jobs": cast(list[PlainJob], jobs), "code": code}
+    with beating(root, handed_over):
+        if logs is not None and made_by is not None:
+            far_answer = work({**given, "logs": logs, "made_by": made_by}, partial(stage_as_task, number=number))
+            hand_over(root, handed_over, far_answer)
+        else:
+            with alive(Path(root)):
+                hand_over(root, handed_over, run_batch(**given))
 
 
 def flow_of(
@@ -128,7 +146,6 @@ def carry_out(
 ) -> NightDocument:
     """Run what the plan says, within a flow run; the JSON of the night. People are told what is new in it, or that it
     failed."""
-    parallel.reaches(night.archive, night.root)
     tell_while_heard()
     with alive(night.root), telling(night) as tell:
         if watcher is not None:
@@ -175,7 +192,7 @@ def _calibrate(
         {"number": n, "root": root, "source": night.source, "jobs": [job.plain() for job in jobs], "code": code}
         for n, jobs in enumerate(batches(night.missing(), parallel.workers))
     ]
-    for given, answer in _answers(parallel, inputs, processes):
+    for given, answer in _answers(night, parallel, inputs, processes):
         if isinstance(answer, Exception):
             say(f"Batch {given['number']} was lost ({type(answer).__name__}: {answer}); its logs follow one by one.")
             answer = _one_by_one(given)
@@ -185,7 +202,10 @@ def _calibrate(
             yield outcome
 
 
-def _answers(parallel: Parallel, inputs: list[Batch], processes: Processes | None) -> Answers:
+def _answers(night: Night, parallel: Parallel, inputs: list[Batch], processes: Processes | None) -> Answers:
+    if parallel.elsewhere and is_far(night.archive, night.root):
+        by_scheduler = parallel.scheduler if parallel.runner == "dask" else None
+        return taken_in(far_pool_answers(inputs) if by_scheduler is None else far_dask_answers(by_scheduler, inputs))
     if parallel.runner == "pool":
         return pool_answers(inputs)
     if parallel.runner == "dask":

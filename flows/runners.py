@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from fieldcal.batch.documents import Answer, Batch
 from fieldcal.errors import FieldcalError
 from fieldcal.flight.job import Job
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.remote.cache import ARCHIVES, WAREHOUSES, called, origin
 
 if TYPE_CHECKING:
+    from distributed import Client
     from prefect import Task
     from prefect_dask.task_runners import DaskTaskRunner
 
@@ -30,8 +29,8 @@ SHARE_OF_A_WORKER = 4
 class Parallel:
     """How many processes, of which kind; `scheduler` is the address of a Dask scheduler.
 
-    "pool": the deployment `batch/fieldcal` of `prefect.yaml`, whose work pool has workers on machines that see the same
-    archive and warehouse.
+    "pool": the deployment `batch/fieldcal` of `prefect.yaml`. Its workers, and those of a scheduler, see the same
+    archive and warehouse as the night: the same folders, or by URL.
 
     Raises
     ------
@@ -49,22 +48,10 @@ class Parallel:
                 ReasonCode.WRONG_OPTION, f"runner must be one of {', '.join(RUNNERS)}, not {self.runner!r}."
             )
 
-    def reaches(self, archive: Path, root: Path) -> None:
-        """Make sure that the workers see what the night works on.
-
-        Raises
-        ------
-        FieldcalError
-            `wrong_option`: copies of what lies in an object store are for processes of this machine.
-        """
-        elsewhere = self.runner == "pool" or self.scheduler is not None
-        copies = [called(one) for kind, one in ((ARCHIVES, archive), (WAREHOUSES, root)) if origin(kind, one)]
-        if elsewhere and copies:
-            told = (
-                f"Workers on other machines do not see the copy of {copies[0]} that is on this one: run the night or "
-                "its sessions on each machine, with --runner process."
-            )
-            raise FieldcalError(ReasonCode.WRONG_OPTION, told)
+    @property
+    def elsewhere(self) -> bool:
+        """Whether the workers may be on other machines."""
+        return self.runner == "pool" or (self.runner == "dask" and self.scheduler is not None)
 
     def here(self) -> int:
         """How many processes of this machine the night may keep busy."""
@@ -127,7 +114,6 @@ def answer_of(future: Finished) -> Answer | Exception:
 
 def _dask(parallel: Parallel) -> DaskTaskRunner:
     try:
-        from distributed import Client
         from prefect_dask.task_runners import DaskTaskRunner
     except ImportError as error:
         raise FieldcalError(ReasonCode.NO_DASK, 'Dask is not installed: pip install "fieldcal[dask]".') from error
@@ -135,9 +121,24 @@ def _dask(parallel: Parallel) -> DaskTaskRunner:
         # Whoever reaches a scheduler has its workers run what he likes: with keys of its own only this process does.
         closed = {"security": True, "dashboard_address": None}
         return DaskTaskRunner(cluster_kwargs={"n_workers": parallel.workers, "threads_per_worker": 1, **closed})
-    try:
-        Client(parallel.scheduler, timeout="10s").close()  # type: ignore[no-untyped-call]
-    except (OSError, TimeoutError, ValueError) as error:
-        what = f"No Dask scheduler answers at {parallel.scheduler} ({error}). Start it, or mend --scheduler."
-        raise FieldcalError(ReasonCode.NO_SCHEDULER, what) from error
+    scheduler_client(parallel.scheduler).close()  # type: ignore[no-untyped-call]
     return DaskTaskRunner(address=parallel.scheduler)
+
+
+def scheduler_client(address: str) -> Client:
+    """A connection to a Dask scheduler.
+
+    Raises
+    ------
+    FieldcalError
+        `no_dask`, `no_scheduler`.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise FieldcalError(ReasonCode.NO_DASK, 'Dask is not installed: pip install "fieldcal[dask]".') from error
+    try:
+        return Client(address, timeout="10s", set_as_default=False)  # type: ignore[no-untyped-call]
+    except (OSError, TimeoutError, ValueError) as error:
+        what = f"No Dask scheduler answers at {address} ({error}). Start it, or mend --scheduler."
+        raise FieldcalError(ReasonCode.NO_SCHEDULER, what) from error

@@ -108,12 +108,14 @@ def units_flown(warehouse: Warehouse, vehicle_id: str | None = None) -> pl.DataF
     last = (
         warehouse.scan("calibration", vehicle_id=vehicle_id)
         .filter("is_primary", counting(warehouse.root))
+        .select("vehicle_id", "imu_id", "unit_id", "sensor", *FLOWN_ORDER)
+        .unique()  # a flight has a hundred rows of a sensor
         .sort(FLOWN_ORDER, nulls_last=False)
         .with_columns(now=pl.col("imu_id").last().over("vehicle_id"))
         .filter(pl.col("imu_id") == pl.col("now"))
     )
     ids = pl.col("imu_id", "unit_id").last()
-    return last.group_by("vehicle_id", "sensor").agg(ids).sort("vehicle_id", "sensor").collect()
+    return last.group_by("vehicle_id", "sensor").agg(ids).sort("vehicle_id", "sensor").collect(engine="streaming")
 
 
 def existing(root: Path) -> Warehouse:

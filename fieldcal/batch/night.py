@@ -24,6 +24,7 @@ from fieldcal.flight.job import Job
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.files import remove_abandoned
 from fieldcal.warehouse.layout import prepare
+from fieldcal.warehouse.remote.handed_over import forget_late
 
 
 class Watcher(Protocol):
@@ -85,6 +86,7 @@ def plan_night(archive: Path, root: Path, config: Path | None = None, session: P
     configuration = configuration_of(source)
     prepare(root)
     remove_abandoned(root)
+    forget_late(root)
     know_sources(root, keep=True)
     plan = make_plan(root, archive, configuration, session)
     write_ledger(root, [*plan.jobs, *plan.copied])

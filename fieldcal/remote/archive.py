@@ -8,7 +8,8 @@ has the same size and time. So a night knows again, without fetching it, a log t
 from __future__ import annotations
 
 import os
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
 from fieldcal.file_locks import fcntl
@@ -40,16 +41,23 @@ def local_archive(url: str) -> Path:
         raise RemoteError(ReasonCode.NO_ARCHIVE, f"There is no archive at {url}: nothing lies below it.")
     folder = note_copy(ARCHIVES, url)
     folder.mkdir(mode=0o700, exist_ok=True)
-    with (folder / ".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with arranged(folder):
         _remove_others(folder, listed)
         for key, one in listed.items():
-            _stand_for(folder / key, one)
+            stand_for(folder / key, one.size, version_ns(one))
     for key, one in listed.items():
         if key.endswith(AT_ONCE) and one.size <= READ_AT_ONCE:
             with here(folder / key):
                 pass
     return folder
+
+
+@contextmanager
+def arranged(folder: Path) -> Iterator[None]:
+    """During the block nobody else puts or removes places of a copy."""
+    with (folder / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 def _can_be_a_file(key: str) -> bool:
@@ -59,14 +67,14 @@ def _can_be_a_file(key: str) -> bool:
     return fits and "\0" not in key and str(PurePosixPath(key)) == key
 
 
-def _stand_for(path: Path, one: Listed) -> None:
-    """Make sure that a file stands for this version of an object."""
+def stand_for(path: Path, size: int, version: int) -> None:
+    """Make sure that a file stands for this version of an object (`content.version_ns`), fetched or not."""
     with suppress(OSError):
         told = path.stat()
-        if (told.st_size, told.st_mtime_ns) == (one.size, version_ns(one)):
+        if (told.st_size, told.st_mtime_ns) == (size, version):
             return
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    stand_in(path, one.size, version_ns(one))
+    stand_in(path, size, version)
 
 
 def _remove_others(folder: Path, listed: dict[str, Listed]) -> None:

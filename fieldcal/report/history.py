@@ -71,7 +71,7 @@ def usable_flights(warehouse: Warehouse, vehicle_id: str | None = None) -> pl.Da
         .select("vehicle_id", *FLOWN_ORDER)
         .unique()
         .sort("vehicle_id", *FLOWN_ORDER, nulls_last=False)
-        .collect()
+        .collect(engine="streaming")
     )
 
 
@@ -83,7 +83,7 @@ def last_usable(warehouse: Warehouse) -> pl.DataFrame:
         .group_by("vehicle_id", "imu_id", "unit_id", "sensor")
         .agg(last_at=pl.col("started_at").max())
         .sort("vehicle_id", "imu_id", "unit_id", "sensor")
-        .collect()
+        .collect(engine="streaming")
     )
 
 

@@ -144,7 +144,7 @@ def vehicle_digest(snapshot: Snapshot, one: Fitness, code: str) -> str:
 
 def flight_digest(snapshot: Snapshot, vehicle_id: str, flight_id: str, code: str) -> str:
     """Digest of all that a flight's page shows."""
-    rows = (snapshot.scan(table, flight_id=flight_id).collect() for table in OF_FLIGHT)
+    rows = (snapshot.scan(table, vehicle_id=vehicle_id, flight_id=flight_id).collect() for table in OF_FLIGHT)
     return _joined([code, vehicle_id, *(f"{of.columns}{of.rows()}" for of in rows)])
 
 

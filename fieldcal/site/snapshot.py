@@ -22,15 +22,18 @@ OF_ALL = {
     CONSTANTS_OF_VEHICLE: CONSTANTS_OF_VEHICLE.replace(" AND a.vehicle_id = ?", ""),
 }
 """What is asked of one vehicle, the last parameter → the same of all."""
+MANY_ROWS = ("calibration", "fit", "information", "moments", "run")
 
 
 class Snapshot(Warehouse):
     """A warehouse as it is at the first question: tables and answers are kept, so that the thousandth page costs what
-    it shows."""
+    it shows. Of tables that have many rows a flight one vehicle's are, the one whose pages are being made: those of a
+    whole fleet would not fit."""
 
     def __init__(self, root: Path) -> None:
         super().__init__(root)
         self._tables: dict[str, pl.DataFrame] = {}
+        self._vehicle: tuple[str, dict[str, pl.DataFrame]] = "", {}
         self._parts: dict[tuple[str, str], dict[str, pl.DataFrame]] = {}
         self._answers: dict[tuple[str, tuple[SqlValue, ...]], pl.DataFrame] = {}
 
@@ -38,6 +41,11 @@ class Snapshot(Warehouse):
         """As `Warehouse.scan`; signals are read anew."""
         if table not in HISTORY_TABLES:
             return super().scan(table, vehicle_id=vehicle_id, flight_id=flight_id)
+        if table in MANY_ROWS:
+            if vehicle_id is None:
+                return super().scan(table, flight_id=flight_id)
+            rows = self._of_vehicle(table, vehicle_id)
+            return (rows if flight_id is None else rows.filter(pl.col("flight_id") == flight_id)).lazy()
         rows = self._whole(table)
         for column, wanted in (("vehicle_id", vehicle_id), ("flight_id", flight_id)):
             if wanted is not None and (column == "vehicle_id" or vehicle_id is None):
@@ -61,7 +69,7 @@ class Snapshot(Warehouse):
 
     @cached_property
     def _sharing(self) -> dict[str, list[str]]:
-        carried = self._whole("calibration").select("vehicle_id", "unit_id").unique()
+        carried = super().scan("calibration").select("vehicle_id", "unit_id").unique().collect()
         both = carried.join(carried, on="unit_id", suffix="_other").select("vehicle_id", "vehicle_id_other").unique()
         return {str(own): rows["vehicle_id_other"].to_list() for (own,), rows in both.group_by("vehicle_id")}
 
@@ -69,6 +77,14 @@ class Snapshot(Warehouse):
         if table not in self._tables:
             self._tables[table] = super().scan(table).collect()
         return self._tables[table]
+
+    def _of_vehicle(self, table: str, vehicle_id: str) -> pl.DataFrame:
+        if self._vehicle[0] != vehicle_id:
+            self._vehicle = vehicle_id, {}
+        kept = self._vehicle[1]
+        if table not in kept:
+            kept[table] = super().scan(table, vehicle_id=vehicle_id).collect()
+        return kept[table]
 
     def _part(self, table: str, column: str, rows: pl.DataFrame) -> dict[str, pl.DataFrame]:
         key = (table, column)

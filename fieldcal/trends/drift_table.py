@@ -8,29 +8,28 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from fieldcal.names import GRAVEST_FIRST, RESIDUAL, Status
+from fieldcal.names import GRAVEST_FIRST
 from fieldcal.provenance.run_key import run_key, source_digest
 from fieldcal.schemas import FLIGHT_TABLES, TABLES, table_key
-from fieldcal.schemas.columns import FLOWN_ORDER
 from fieldcal.schemas.reference import ENOUGH_SESSIONS
 from fieldcal.schemas.rows import DriftRow
 from fieldcal.trends import few_sessions, regression, siblings, temperatures
 from fieldcal.trends.curves import Bends, Bent, bends_of, bent
 from fieldcal.trends.evidence import evidence
 from fieldcal.trends.evidence_cache import Memory
+from fieldcal.trends.fleet.publishing import publish_where_other
+from fieldcal.trends.fleet.rows import history_of_everything
 from fieldcal.trends.more_sessions import needed
 from fieldcal.trends.one_sensor import of_present_sensor, told
 from fieldcal.trends.pooled import verdicts
 from fieldcal.trends.pooled.table import pooled_table, update_pooled
-from fieldcal.trends.reasons import AGREEMENT, VPS, reason
+from fieldcal.trends.reasons import VPS, reason
 from fieldcal.trends.series import Histories
 from fieldcal.trends.warm_up_slopes import slopes_of_warm_ups
 from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.decisions.withdrawn import counting
-from fieldcal.warehouse.layout import history_files, vehicle_of
-from fieldcal.warehouse.publish import publish
+from fieldcal.warehouse.layout import history_files
 from fieldcal.warehouse.questions import existing, those_asked_for
-from fieldcal.warehouse.store import empty_frame, read_table
+from fieldcal.warehouse.store import empty_frame
 from fieldcal.words.rows import typed
 
 KEY = list(table_key("drift"))
@@ -61,11 +60,10 @@ def update_drift(root: Path) -> tuple[str, ...]:
         before = _state(root)
         changed |= set(update_pooled(root))
         memory = Memory(root, run_key("evidence", source_digest(evidence), {}, {}))
-        table = drift_table(root, memory, Warehouse(root).scan("pooled").collect())
+        rows = history_of_everything(root, remember=True)
+        table = table_of(rows, bends_of(root), memory, Warehouse(root).scan("pooled").collect())
         memory.save()
-        for vehicle_id in sorted(set(table["vehicle_id"].to_list()) | _with_drift(root)):
-            if publish(root, vehicle_id, {"drift": table.filter(pl.col("vehicle_id") == vehicle_id)}, ()):
-                changed.add(vehicle_id)
+        changed |= publish_where_other(root, "drift", table)
         if _state(root) == before:
             break
     return tuple(sorted(changed))
@@ -128,54 +126,6 @@ def table_of(
     return explained.select(TABLES["drift"].column_names).sort(KEY)
 
 
-def history_of_everything(root: Path) -> pl.DataFrame:
-    """Values that were not refused: calibrated parameters, the VPS clock's lag and skew, Theil's coefficients.
-
-    One row a flight and series, sorted by series and time. A series keeps to the unit of its last flight, and to
-    flights with a time where any has one.
-    """
-    warehouse = Warehouse(root)
-    lead = ["vehicle_id", "imu_id", "unit_id", "session_id", *FLOWN_ORDER]
-    columns = [*lead, "sensor", "method", "parameter", "axis", "value", "sd", "unit", "temperature_degc"]
-    # What remains of an autopilot's own correction steps with its parameters, not with the sensor.
-    own = (pl.col("status") == Status.OK) & ~pl.col("parameter").str.starts_with(RESIDUAL)
-    calibration = warehouse.scan("calibration").filter(own).select(columns)
-    warm = warehouse.scan("flight").select("vehicle_id", "flight_id", temperature_degc="temperature_mean_degc")
-    text = {"sensor": pl.lit(VPS), "method": pl.lit("sync"), "axis": pl.lit("")}
-    flight = ["vehicle_id", "flight_id"]
-    sync = warehouse.scan("sync").filter(pl.col("status") == Status.OK).join(warm, on=flight, how="left")
-    clock = [
-        sync.with_columns(**text, parameter=pl.lit(name), value=value, sd=sd, unit=pl.lit(unit)).select(columns)
-        for name, value, sd, unit in (
-            ("lag", pl.col("lag_mid_s"), pl.col("lag_sd_s"), "s"),
-            ("skew", pl.col("skew_ppm"), pl.col("skew_sd_ppm"), "ppm"),
-        )
-    ]
-    fit = (
-        warehouse.scan("fit")
-        .filter((pl.col("signal") == "raw") & (pl.col("sample") == "all"))
-        .filter(counting(root))
-        .join(warm, on=flight, how="left")
-        .with_columns(
-            sensor=pl.lit(AGREEMENT),
-            parameter=pl.concat_str(pl.lit("tic_"), pl.col("quantity")),
-            axis=pl.col("reference"),
-            value=pl.col("tic"),
-            sd=pl.lit(None, dtype=pl.Float64),
-            unit=pl.lit("1"),
-        )
-        .select(columns)
-    )
-    rows = pl.concat([calibration, *clock, fit]).filter(pl.col("value").is_finite()).collect()
-    timed = pl.col("started_at").is_not_null()
-    order = [*KEY, "started_at", "vehicle_id", "sequence", "flight_id"]
-    return (
-        rows.sort(order, nulls_last=False)
-        .filter((pl.col("unit") == pl.col("unit").last().over(KEY)) & (timed | ~timed.any().over(KEY)))
-        .sort(order, nulls_last=False)
-    )
-
-
 def trends_of(
     flights: pl.DataFrame, bends: Bends, memory: Memory
 ) -> tuple[pl.DataFrame, regression.Trends, np.ndarray]:
@@ -213,7 +163,8 @@ def trends_of(
         trends = trends if curves is None else curves.widened(trends)
     rows = _with_curves(rows, curves)
     # A flight set aside is not what the line is as of.
-    last = numbered.filter(pl.Series(trends.kept)).group_by("row").agg(as_of=pl.col("started_at").last())
+    kept_at = numbered.select("row", "started_at").filter(pl.Series(trends.kept))
+    last = kept_at.group_by("row").agg(as_of=pl.col("started_at").last())
     rows = rows.join(last, on="row", how="left", maintain_order="left")
     stepped, drifting = regression.moving(trends)
     steady = (trends.n_sessions >= ENOUGH_SESSIONS) & ~stepped & ~drifting
@@ -269,18 +220,6 @@ def _state(root: Path) -> list[tuple[str, int, int, int]]:
     """What the files of the history are; they are replaced whole, so another content is another file."""
     files = [path for table in (*FLIGHT_TABLES, "decision") for path in history_files(root, table)]
     return [(str(path), (s := path.stat()).st_ino, s.st_size, s.st_mtime_ns) for path in files]
-
-
-def _with_drift(root: Path) -> set[str]:
-    """Vehicles that have a table already."""
-    found: set[str] = set()
-    for path in history_files(root, "drift"):
-        vehicle_id = vehicle_of(path)
-        if vehicle_id is None:
-            found |= set(read_table(path, "drift")["vehicle_id"].to_list())
-        else:
-            found.add(vehicle_id)
-    return found
 
 
 def drift_rows(root: Path, vehicle: str | None, sensor: str | None, parameter: str | None) -> pl.DataFrame:

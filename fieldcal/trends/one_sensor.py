@@ -156,6 +156,8 @@ def _wide(scales: pl.DataFrame) -> pl.DataFrame:
 def _grouped(scales: Array, sd: Array) -> np.ndarray:
     """Number (n,) of the sensor that each flight is of, by its scales (n, 3): the nearest known one, or a new one."""
     which = np.zeros(len(scales), dtype=int)
+    if _all_alike(scales, sd):
+        return which
     known: list[list[int]] = []
     for flight in range(len(scales)):
         distances = [_distance(scales, sd, flight, members) for members in known]
@@ -182,6 +184,17 @@ def _confirmed(scales: Array, sd: Array, which: np.ndarray) -> np.ndarray:
                 out[members] = True
                 break
     return out
+
+
+def _all_alike(scales: Array, sd: Array) -> bool:
+    """Whether no flight is another sensor's than the mean of those before it: most units fly with one, and are not
+    compared flight by flight."""
+    weight = 1.0 / sd**2
+    before = np.cumsum(weight, axis=0)[:-1]
+    mean = np.cumsum(weight * scales, axis=0)[:-1] / before
+    off = scales[1:] - mean
+    other = (np.abs(off) > OTHER_SHARE * np.abs(mean)) & (off**2 > OTHER_SD**2 * (1.0 / before + sd[1:] ** 2))
+    return not (np.sum(other, axis=1) >= LEAST_AXES).any()
 
 
 def _distance(scales: Array, sd: Array, flight: int, members: list[int]) -> float:

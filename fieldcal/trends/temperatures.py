@@ -19,7 +19,8 @@ def judged(flights: pl.DataFrame) -> tuple[pl.DataFrame, dict[str, str]]:
     low, high = PLAUSIBLE_DEGC
     possible = warm.is_between(low, high)
     by_unit = (
-        flights.filter(warm.is_not_null())
+        flights.select(unit, "vehicle_id", "session_id", warm)
+        .filter(warm.is_not_null())
         .group_by(unit, maintain_order=True)
         .agg(
             impossible=(~possible).mean(),

@@ -60,7 +60,7 @@ def fleet(grown: Path, tmp_path: Path) -> Fleet:
 def test_nothing_is_looked_at_twice_and_the_same_is_said(fleet: Fleet) -> None:
     assert fleet.plan() == (VEHICLES, 0, 0)
     said = {entry["log_uri"]: entry for entry in fleet.night().plan.done.values()}
-    (fleet.root / "night" / "seen.json").unlink()
+    shutil.rmtree(fleet.root / "night" / "seen")
     night = plan_night(fleet.archive, fleet.root)
     looked_at = {outcome.job.log_uri: outcome.entry() for outcome in night.unchanged()}
     assert said == looked_at
@@ -89,7 +89,7 @@ def touched(path: Path) -> None:
         (lambda f: os.utime(of_first(f.archive, "*.mcap")), (1, 1, 0)),
         (lambda f: os.utime(of_first(f.root / "tables" / "flight", "*.parquet")), (1, 1, 0)),
         (lambda f: shutil.rmtree(f.root / "tables"), (0, VEHICLES, 0)),
-        (lambda f: (f.root / "night" / "seen.json").write_text("{"), (0, VEHICLES, 0)),
+        (lambda f: of_first(f.root / "night" / "seen", "*.json").write_text("{"), (1, 1, 0)),
         (lambda f: of_first(f.archive, "*.mcap").unlink(), (1, 0, 0)),
     ],
 )

@@ -163,11 +163,13 @@ def test_no_log_runs_in_this_process_and_no_process_starts_for_nothing() -> None
 
 
 def test_an_answer_of_the_pool_is_read_once_and_whole(tmp_path: Path) -> None:
-    from fieldcal.flows.pool import _place, _taken
+    from fieldcal.flows.pool import _folder, _taken
 
-    hand_over(tmp_path, "a", {"outcomes": [], "error": None})
-    assert _taken(tmp_path, "a", "Completed") == {"outcomes": [], "error": None}
-    assert isinstance(_taken(tmp_path, "a", "Completed"), FieldcalError)
-    hand_over(tmp_path, "b", {"outcomes": [], "error": None})
-    _place(tmp_path, "b").write_bytes(_place(tmp_path, "b").read_bytes().replace(b"[]", b"{}"))
-    assert isinstance(_taken(tmp_path, "b", "Completed"), FieldcalError)
+    root = str(tmp_path)
+    hand_over(root, "a", {"outcomes": [], "error": None})
+    assert _taken(root, "a", "Completed") == {"outcomes": [], "error": None}
+    assert isinstance(_taken(root, "a", "Completed"), FieldcalError)
+    hand_over(root, "b", {"outcomes": [], "error": None})
+    place = _folder(root) / "b.json"
+    place.write_bytes(place.read_bytes().replace(b"[]", b"{}"))
+    assert isinstance(_taken(root, "b", "Completed"), FieldcalError)

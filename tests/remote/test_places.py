@@ -8,9 +8,11 @@ import pytest
 
 from fieldcal.cli.main import run
 from fieldcal.errors import FieldcalError
-from fieldcal.flows.runners import Parallel
+from fieldcal.flight.job import file_stamp
 from fieldcal.remote.cache import ARCHIVES, FOLDER, WAREHOUSES, called, copy_of, note_copy
+from fieldcal.remote.content import stand_in
 from fieldcal.remote.places import archive_at, log_at, session_at
+from fieldcal.remote.sent import received, sent
 from fieldcal.remote.url import above
 
 URL = "s3://logs/fleet"
@@ -51,12 +53,29 @@ def test_a_copy_is_called_by_its_url(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert called(tmp_path / "folder") == str(tmp_path / "folder")
 
 
-@pytest.mark.parametrize("parallel", [Parallel(2, "pool"), Parallel(2, "dask", "tcp://10.0.0.5:8786")])
-def test_workers_that_see_no_copy_are_refused(
-    parallel: Parallel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("layout", ["file", "folder", "file again"])
+def test_a_log_is_named_for_another_machine_whatever_lay_there_before(
+    layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(FOLDER, str(tmp_path))
-    parallel.reaches(tmp_path / "archive", tmp_path / "warehouse")
-    with pytest.raises(FieldcalError, match=f"do not see the copy of {URL}"):
-        parallel.reaches(note_copy(ARCHIVES, URL), tmp_path / "warehouse")
-    Parallel(2, "dask").reaches(note_copy(ARCHIVES, URL), tmp_path / "warehouse")
+    here, there = tmp_path / "here", tmp_path / "there"
+    monkeypatch.setenv(FOLDER, str(here))
+    log = note_copy(ARCHIVES, URL) / "v" / "s" / "flight"
+    files = [log / "a", log / "b"] if layout == "folder" else [log]
+    for n, file in enumerate(files):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        stand_in(file, 1000 + n, 5_000_000_000 + n)
+    named = sent(log)
+    assert named is not None
+    assert sent(tmp_path / "elsewhere") is None
+    monkeypatch.setenv(FOLDER, str(there))
+    former = note_copy(ARCHIVES, URL) / "v" / "s" / "flight"
+    lay = {"file": former.parent, "folder": former, "file again": former / "c"}[layout]
+    lay.parent.mkdir(parents=True)
+    stand_in(lay, 7, 7)
+    place = received(named)
+    assert place == former
+    assert file_stamp(place) == tuple(
+        value for n in range(len(files)) for value in (1000 + n, *[5_000_000_000 + n] * 2, 0)
+    )
+    with pytest.raises(ValueError, match="another log"):
+        received({**named, "files": {"v/s/other": [1, 1]}})

@@ -251,8 +251,8 @@ def test_flights_published_meanwhile_are_in_the_trends(tmp_path: Path, monkeypat
     assert published["v00"].height == late.height
     read = drift_table_module.history_of_everything
 
-    def and_then_another(root: Path) -> pl.DataFrame:
-        rows_read = read(root)
+    def and_then_another(root: Path, *, remember: bool) -> pl.DataFrame:
+        rows_read = read(root, remember=remember)
         publish(root, "v01", {"calibration": late}, late["flight_id"].unique().to_list())
         return rows_read
 

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from fieldcal.remote.objects import Objects
-from fieldcal.warehouse.remote.heads import GRACE, HEADS, LIVE, OBJECTS, head_key, name_of, read_head
+from fieldcal.warehouse.remote.heads import GRACE, HANDED_OVER, HEADS, LIVE, OBJECTS, head_key, name_of, read_head
 from fieldcal.warehouse.remote.known import objects_of
 from fieldcal.warehouse.remote.live import bring_up
 from fieldcal.warehouse.remote.signals import listed
@@ -40,7 +40,7 @@ def garbage(root: Path, now: datetime | None = None) -> Garbage | None:
     if objects is None:
         return None
     before = (now or datetime.now(UTC)) - GRACE
-    old = [one for one in objects.listed(OBJECTS) if one.modified < before]
+    old = [one for prefix in (OBJECTS, HANDED_OVER) for one in objects.listed(prefix) if one.modified < before]
     named: set[str] = set()
     for one in objects.listed(HEADS):
         if one.key == head_key(name := name_of(one.key)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -16,7 +17,9 @@ from fieldcal.schemas import HISTORY_TABLES
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.sealed import BrokenSeal, unseal
 
-HEADS, OBJECTS, LIVE = "heads", "objects", "tables"
+HEADS, OBJECTS, LIVE, HANDED_OVER = "heads", "objects", "tables", "handed-over"
+PLACE = re.compile(r"[a-z_]+(\.[0-9]+)?/[A-Za-z0-9%~-][A-Za-z0-9%~._-]*")
+"""Of readings: "<table>/<flight>"."""
 GRACE = timedelta(days=7)
 """How long what no head names stays: for readers that still read it, and writers that have yet to name it."""
 

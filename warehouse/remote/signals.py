@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -14,29 +13,34 @@ from fieldcal.warehouse import checksums
 from fieldcal.warehouse.errors import disk
 from fieldcal.warehouse.files import file_sha256, write_bytes
 from fieldcal.warehouse.layout import SIGNAL_PARTITION, checksum_path, encode_id
-from fieldcal.warehouse.remote.heads import Head, Kept
+from fieldcal.warehouse.remote.handed_over import expected
+from fieldcal.warehouse.remote.heads import PLACE, Head, Kept
 from fieldcal.warehouse.remote.known import fetched, in_threads, known_head, known_names, objects_of
 from fieldcal.warehouse.sealed import seal, unseal
 
-_PLACE = re.compile(r"[a-z_]+(\.[0-9]+)?/[A-Za-z0-9%~-][A-Za-z0-9%~._-]*")
 Listing = Mapping[str, Kept]
-"""Place of a file, "<table>/<flight>", → its object."""
+"""Place of a file, "<table>/<flight>" (`PLACE`), → its object."""
 
 
 def with_own_signals(
     root: Path, objects: Objects, before: Head, flights: Collection[str]
 ) -> tuple[Kept | None, list[tuple[str, bytes | Path]]]:
-    """The list of a vehicle's readings with those that flights have in the copy, and what is to be uploaded for it."""
+    """The list of a vehicle's readings with those that flights have in the copy, or that other machines have uploaded
+    already, and what is to be uploaded for it."""
     name = encode_id(before.vehicle_id)
-    listing = dict(listed(root, objects, before))
+    former = listed(root, objects, before)
+    listing = dict(former)
     fresh: list[tuple[str, bytes | Path]] = []
     for flight in sorted(flights):
+        for place, one in expected(root, before.vehicle_id, flight).items():
+            if place not in listing or listing[place].sha256 != one.sha256:
+                listing[place] = one
         for path in sorted((root / "signals").glob(f"*/{SIGNAL_PARTITION}{name}/{encode_id(flight)}.parquet")):
             place, sha256 = f"{path.parent.parent.name}/{path.stem}", checksums.assured(root, path)
             if place not in listing or listing[place].sha256 != sha256:
                 listing[place] = Kept.new(sha256, path.stat().st_size)
                 fresh.append((listing[place].key, path))
-    if not fresh:
+    if listing == former:
         return before.signals, []
     data = seal({place: [one.key, one.sha256, one.size] for place, one in listing.items()})
     list_itself = Kept.new(hashlib.sha256(data).hexdigest(), len(data))
@@ -57,7 +61,7 @@ def listed(root: Path, objects: Objects, head: Head | None) -> Listing:
 
 def _decoded(data: bytes) -> Listing:
     listing = {where: Kept(*one) for where, one in cast(Mapping[str, Any], unseal(data)).items()}
-    return {where: one for where, one in listing.items() if _PLACE.fullmatch(where)}
+    return {where: one for where, one in listing.items() if PLACE.fullmatch(where)}
 
 
 def fetch_signals(root: Path, table: str, vehicle_id: str | None = None, flight_id: str | None = None) -> None:

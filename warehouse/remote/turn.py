@@ -17,6 +17,7 @@ from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.layout import encode_id, history_path
 from fieldcal.warehouse.lock import vehicle_lock
 from fieldcal.warehouse.remote.copy import begin_ahead, end_ahead, take_head
+from fieldcal.warehouse.remote.handed_over import published
 from fieldcal.warehouse.remote.heads import Head, Kept, head_key, read_head
 from fieldcal.warehouse.remote.known import in_threads, know_head, objects_of
 from fieldcal.warehouse.remote.signals import with_own_signals
@@ -56,6 +57,7 @@ def in_turn(
             result = change()
             if _committed(root, objects, before, tag, flights):
                 end_ahead(root, name)
+                published(root, vehicle_id, flights)
                 return result
             time.sleep(random.uniform(0.0, wait_s))
             wait_s = min(2 * wait_s, _LONGEST_WAIT_S)

@@ -132,7 +132,7 @@ def night_files(root: Path) -> Iterator[Problem]:
             yield str(path.relative_to(root)), None
         except (BrokenSeal, WarehouseError) as error:
             yield str(path.relative_to(root)), f"what the night remembers is damaged: {error}; it may be deleted"
-    for path in sorted((root / "night").rglob("*.npz")):
+    for path in sorted([*(root / "night").rglob("*.npz"), *(root / "night").rglob("*.bin")]):
         with disk(path, "read"):
             data = path.read_bytes()
         whole = hashlib.sha256(data[SHA256_BYTES:]).digest() == data[:SHA256_BYTES]

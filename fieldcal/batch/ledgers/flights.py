@@ -3,7 +3,8 @@
 Of each flight it is remembered what its results follow from, which files they are with their size, times and inode, and
 what the night says of it. Where all of that is as it was, and the history of its vehicle too, the flight is done:
 a thousand flights cost some tenths of a second. What changes a byte without changing its file's times is for
-`fieldcal verify` to find. The file may be deleted at any time.
+`fieldcal verify` to find. A file a vehicle, `night/seen/<vehicle>.json`, which may be deleted at any time: a night
+never has those of a whole fleet at hand.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from fieldcal.provenance.run_key import library_versions
 from fieldcal.schemas import FLIGHT_TABLES
 from fieldcal.stages.pipeline import INGEST
 from fieldcal.warehouse.files import write_bytes
-from fieldcal.warehouse.layout import checksum_path, history_path, signal_path, stage_folder
+from fieldcal.warehouse.layout import checksum_path, encode_id, history_path, signal_path, stage_folder
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 from fieldcal.warehouse.stage_store import RECORD
 
@@ -48,21 +49,14 @@ class Ledger:
 
     def __init__(self, root: Path, configuration: Configuration, shared: Shared | None = None) -> None:
         self._root, self._configuration, self._shared = root, configuration, shared
-        self._flights: Mapping[str, Seen] = {}
-        self._histories: Mapping[str, str] = {}
-        try:
-            found = unseal(_place(root).read_bytes())
-            self._flights = cast(Mapping[str, Seen], found["flights"])
-            self._histories = cast(Mapping[str, str], found["histories"])
-        except (OSError, BrokenSeal, KeyError):
-            pass
+        self._read: tuple[str | None, Mapping[str, Seen], str | None] = None, {}, None
         self._common = _common(configuration)
         self._vehicles: dict[str, str] = {}
         self._same_history: dict[str, bool] = {}
 
     def entry(self, job: Job) -> LogEntry | None:
         """What to say of a flight of which everything is as it was; None of any other."""
-        known = self._flights.get(job.flight_id)
+        known = self._of_flights(job.vehicle_id)[0].get(job.flight_id)
         if known is not None and self._is_as_it_was(job, known):
             return known["entry"]
         return None if self._shared is None else self._shared.entry(job, self._of_content(job))
@@ -75,30 +69,54 @@ class Ledger:
 
     def remember(self, outcomes: Iterable[Outcome], done: Mapping[str, LogEntry]) -> None:
         """Remember a night's flights: the outcomes, all of whose results were kept, and those that were `done`."""
-        flights: dict[str, Seen] = {known: self._flights[known] for known in done if known in self._flights}
-        vehicles = {entry["vehicle_id"] for entry in done.values()}
+        by_vehicle: dict[str, tuple[list[str], list[Outcome]]] = {}
+        for flight_id, entry in done.items():
+            by_vehicle.setdefault(entry["vehicle_id"], ([], []))[0].append(flight_id)
         for outcome in outcomes:
-            vehicles.add(outcome.job.vehicle_id)
-            seen = self._seen(outcome)
-            if seen is not None:
-                flights[outcome.job.flight_id] = seen
-        others = {flight_id: seen for flight_id, seen in self._flights.items() if flight_id not in flights}
-        kept = {flight_id: seen for flight_id, seen in others.items() if seen["entry"]["vehicle_id"] not in vehicles}
-        histories = {**self._histories, **{vehicle: _history(self._root, vehicle) for vehicle in vehicles}}
-        sealed = seal({"flights": {**kept, **flights}, "histories": histories})
-        write_bytes(_place(self._root), sealed, durable=False)
+            by_vehicle.setdefault(outcome.job.vehicle_id, ([], []))[1].append(outcome)
+        for vehicle_id, (as_before, others) in by_vehicle.items():
+            known, of_history = self._of_flights(vehicle_id)
+            flights = {flight_id: known[flight_id] for flight_id in as_before if flight_id in known}
+            seen = {outcome.job.flight_id: self._seen(outcome) for outcome in others}
+            flights |= {flight_id: one for flight_id, one in seen.items() if one is not None}
+            history = _history(self._root, vehicle_id)
+            if flights != known or history != of_history:
+                sealed = seal({"flights": flights, "history": history})
+                write_bytes(_place(self._root, vehicle_id), sealed, durable=False)
+        (self._root / "night" / "seen.json").unlink(missing_ok=True)  # of an older release, for the whole fleet
+        self._read = None, {}, None
 
-    def as_they_were(self, flights: Iterable[str]) -> list[str]:
-        """Those of the flights whose results are as they were when they were remembered."""
-        known = {one: self._flights[one] for one in flights if one in self._flights}
-        return [one for one, seen in known.items() if _stamps(self._root, seen["files"]) == seen["as_they_were"]]
+    def as_they_were(self, flights: Mapping[str, str]) -> dict[str, str]:
+        """Those of the flights (flight_id → vehicle_id) whose results are as they were when they were remembered."""
+        by_vehicle = sorted(flights.items(), key=lambda flight: flight[1])
+        known = {one: self._of_flights(vehicle_id)[0].get(one) for one, vehicle_id in by_vehicle}
+        return {
+            one: flights[one]
+            for one, seen in known.items()
+            if seen is not None and _stamps(self._root, seen["files"]) == seen["as_they_were"]
+        }
 
-    def let_go(self, flights: Iterable[str]) -> None:
-        """Remember flights whose results were removed since as they are now: there is nothing to do for them."""
-        stamped = {one: _stamps(self._root, self._flights[one]["files"]) for one in flights}
-        of_now = {one: {**self._flights[one], "as_they_were": stamp} for one, stamp in stamped.items()}
-        sealed = seal({"flights": {**self._flights, **of_now}, "histories": self._histories})
-        write_bytes(_place(self._root), sealed, durable=False)
+    def let_go(self, flights: Mapping[str, str]) -> None:
+        """Remember flights (flight_id → vehicle_id) whose results were removed since as they are now: there is nothing
+        to do for them."""
+        for vehicle_id in sorted(set(flights.values())):
+            known, history = self._of_flights(vehicle_id)
+            own = {one: known[one] for one, whose in flights.items() if whose == vehicle_id}
+            of_now = {one: {**seen, "as_they_were": _stamps(self._root, seen["files"])} for one, seen in own.items()}
+            sealed = seal({"flights": {**known, **of_now}, "history": history})
+            write_bytes(_place(self._root, vehicle_id), sealed, durable=False)
+        self._read = None, {}, None
+
+    def _of_flights(self, vehicle_id: str) -> tuple[Mapping[str, Seen], str | None]:
+        """A vehicle's flights, and the digest of its history; those of the last vehicle asked about are at hand."""
+        if self._read[0] != vehicle_id:
+            try:
+                found = unseal(_place(self._root, vehicle_id).read_bytes())
+                own = cast(Mapping[str, Seen], found["flights"]), str(found["history"])
+                self._read = vehicle_id, *own
+            except (OSError, BrokenSeal, KeyError):
+                self._read = vehicle_id, {}, None
+        return self._read[1], self._read[2]
 
     def _seen(self, outcome: Outcome) -> Seen | None:
         job, records = outcome.job, outcome.records
@@ -130,7 +148,7 @@ class Ledger:
 
     def _history_is_same(self, vehicle_id: str) -> bool:
         if vehicle_id not in self._same_history:
-            known = self._histories.get(vehicle_id)
+            known = self._of_flights(vehicle_id)[1]
             self._same_history[vehicle_id] = known is not None and known == _history(self._root, vehicle_id)
         return self._same_history[vehicle_id]
 
@@ -177,5 +195,5 @@ def _history(root: Path, vehicle_id: str) -> str:
     return _stamps(root, [str(path.relative_to(root)) for path in files])
 
 
-def _place(root: Path) -> Path:
-    return root / "night" / "seen.json"
+def _place(root: Path, vehicle_id: str) -> Path:
+    return root / "night" / "seen" / f"{encode_id(vehicle_id)}.json"

@@ -17,14 +17,13 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import Status
 from fieldcal.provenance.run_key import run_key, source_digest
 from fieldcal.schemas import TABLES, table_key
+from fieldcal.trends.fleet.publishing import publish_where_other
 from fieldcal.trends.one_sensor import told
 from fieldcal.trends.pooled.memory import Memory
 from fieldcal.trends.pooled.present import information_that_counts
 from fieldcal.trends.pooled.rows import rows_of_unit, strengths_told
 from fieldcal.trends.pooled.units import DAY, EPOCH, HistoryUnit, by_unit, first_that_tell, sessions_flown, unit_of
-from fieldcal.warehouse.layout import history_files
-from fieldcal.warehouse.publish import publish
-from fieldcal.warehouse.store import empty_frame, read_table
+from fieldcal.warehouse.store import empty_frame
 
 KEY = list(table_key("pooled"))
 MOST_UNITS = 40
@@ -44,14 +43,7 @@ def update_pooled(root: Path) -> tuple[str, ...]:
     memory = Memory(root, run_key("pooled", source_digest(kinds_of, rows_of), {}, {}))
     table = pooled_table(root, memory)
     memory.save()
-    there: set[str] = set()
-    for path in history_files(root, "pooled"):
-        there |= set(read_table(path, "pooled")["vehicle_id"].to_list())
-    return tuple(
-        vehicle_id
-        for vehicle_id in sorted(set(table["vehicle_id"].to_list()) | there)
-        if publish(root, vehicle_id, {"pooled": table.filter(pl.col("vehicle_id") == vehicle_id)}, ())
-    )
+    return tuple(sorted(publish_where_other(root, "pooled", table)))
 
 
 def pooled_table(root: Path, memory: Memory | None = None) -> pl.DataFrame:

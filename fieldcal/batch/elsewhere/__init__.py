@@ -1,0 +1,1 @@
+"""Batches on machines that share nothing with this one but an object store."""
