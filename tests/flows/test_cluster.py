@@ -44,7 +44,7 @@ from fieldcal.warehouse.content import content_sha256
 from fieldcal.warehouse.query import Warehouse
 from fieldcal.warehouse.upkeep.verify import verify
 
-LOGS = "s3://logs/fleet"
+LOGS = "s3://logs/cluster"
 N_FLIGHTS = 2
 TELLS = """
 import os, sys

@@ -28,7 +28,6 @@ from fieldcal.warehouse.remote.known import fetched, in_threads
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
 
 _MEMBER = re.compile(r"stages(/[A-Za-z0-9%~_-][A-Za-z0-9%~._-]*){4}")
-
 _FORGOTTEN_AFTER_S = GRACE.total_seconds() / 2
 """Objects that no head names yet may go when they are as old as `GRACE`."""
 
