@@ -247,7 +247,7 @@ def test_pointer_and_keyboard_read_the_values_of_the_history(browser: Any, site:
     own = own.filter(sensor="gyroscope", parameter="zero_bias", axis="x").collect()
     trend = Warehouse(site.parent).scan("drift", vehicle_id="bravo")
     trend = trend.filter(sensor="gyroscope", parameter="zero_bias", axis="x").collect()
-    at_25 = own["value"] - trend["slope_per_degc"][0] * (own["temperature_degc"] - 25.0)
+    at_25 = np.degrees(own["value"] - trend["slope_per_degc"][0] * (own["temperature_degc"] - 25.0))
 
     over = chart.find_element("css selector", ".u-over")
     half = over.rect["width"] / 2

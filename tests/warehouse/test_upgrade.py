@@ -181,6 +181,7 @@ for number in range(int(sys.argv[3])):
 """
 
 
+@outside_ci
 def test_killed_at_any_rename_it_is_finished_by_the_next(tmp_path: Path) -> None:
     """Around every file its record is written before and after."""
     root = older("b07b24e", tmp_path / "warehouse")
