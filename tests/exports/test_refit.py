@@ -6,7 +6,8 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from onboard_support import readings, tilting
 
 import fieldcal
 from fieldcal.cli.main import run
+from fieldcal.exports.refit import _noise
 from fieldcal.geometry.rotation import from_rotation_vector, multiply
 from fieldcal.onboard import Limits, Moments, MomentsFit, RateEquations, RatesFit, dump
 from fieldcal.simulation.archive import settings, signals
@@ -191,6 +193,14 @@ def test_names_that_are_not_there(fleet: Fleet, capsys: pytest.CaptureFixture[st
     found = json.loads(out)
     assert {r["status"] for r in found} == {"refused"}
     assert (found[0]["n_flights"], found[0]["method"], found[0]["unit_id"]) == (2, "moments", "imu-of-v")
+
+
+def test_noise_of_two_flights_adds_up_axis_by_axis() -> None:
+    quiet = SimpleNamespace(noise=np.array([1.0, 2.0, 3.0]), n_differences=5)
+    loud = SimpleNamespace(noise=np.array([10.0, 40.0, 90.0]), n_differences=7)
+    noise, n_differences = _noise(cast(Any, [quiet, loud]))
+    assert noise.tolist() == [11.0, 42.0, 93.0]
+    assert n_differences == 12
 
 
 def test_the_gyroscopes_equations_add_up_too(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 from outside_ci import outside_ci
 from velocity_support import epochs_of, errors, fitted, priors, readings_of, short_flight, with_readings
 
+import fieldcal.estimation.by_velocity.fit as by_velocity
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.by_velocity.fit import FEWEST_EPOCHS
 from fieldcal.estimation.by_velocity.information import observed
@@ -115,6 +116,16 @@ def test_outliers_change_nothing_much() -> None:
     clean, spoilt = (errors(f, fitted(f)) for f in (flight, replace(flight, gnss_velocity=wrong)))
     for name, (error, sd) in clean.items():
         assert np.all(np.abs(spoilt[name][0] - error) < sd), name
+
+
+def test_what_clipped_residuals_do_not_tell_is_in_every_sd(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the factor that `huber_inflation` has of the receiver's weights, which is tested by itself."""
+    flight = short_flight("lively", 7)
+    covariance = []
+    for inflation in (1.0, 4.0):
+        monkeypatch.setattr(by_velocity, "huber_inflation", lambda weights, inflation=inflation: inflation)
+        covariance.append(fitted(flight).covariance)
+    assert np.allclose(covariance[1], 4.0 * covariance[0], rtol=1e-9)
 
 
 def test_attitude_is_that_of_the_flight() -> None:
