@@ -163,6 +163,7 @@ def test_an_unchanged_night_runs_nothing_and_changes_no_byte(simulated: Path, wa
     assert {part: file_hashes(warehouse / part) for part in before} == before
 
 
+@outside_ci
 def test_a_history_of_an_older_release_is_shown_and_brought_up_to_date(simulated: Path, warehouse: Path) -> None:
     before = content_sha256(warehouse), file_hashes(warehouse / "tables")
     young = {
@@ -388,7 +389,8 @@ def wait_for_stages(root: Path, count: int, process: subprocess.Popen[bytes]) ->
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("stages_done", [3, pytest.param(16, marks=outside_ci)])
+@outside_ci
+@pytest.mark.parametrize("stages_done", [3, 16])
 def test_a_killed_night_ends_like_an_uninterrupted_one(
     simulated: Path, first_night: tuple[Path, Any], tmp_path: Path, stages_done: int
 ) -> None:
@@ -403,7 +405,7 @@ def test_a_killed_night_ends_like_an_uninterrupted_one(
     assert verify(root)["ok"]
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=outside_ci), 2])
 def test_an_interrupt_ends_the_night_in_two_seconds(
     simulated: Path, first_night: tuple[Path, Any], tmp_path: Path, workers: int
 ) -> None:
