@@ -211,6 +211,7 @@ def test_a_night_on_a_history_that_it_cannot_read_says_what_to_do(simulated: Pat
     assert verify(warehouse)["ok"]
 
 
+@outside_ci
 def test_a_changed_cut_off_runs_smoothing_and_what_reads_from_it(archive: Path, warehouse: Path) -> None:
     config = archive / "fieldcal.toml"
     original = config.read_text()

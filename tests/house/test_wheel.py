@@ -102,6 +102,7 @@ def test_what_is_installed_has_no_generic_name(environment: Path) -> None:
     assert not any(f"'{name}'" in found for name in ("flows", "schemas", "warehouse"))
 
 
+@outside_ci
 def test_a_night_in_a_folder_with_hostile_names(environment: Path, tmp_path: Path) -> None:
     here = tmp_path / "here"
     for name in HOSTILE:
