@@ -242,34 +242,34 @@ def latest_of_one(root: Path) -> None:
         Warehouse(root).sql("FROM latest_calibration WHERE vehicle_id = 'uav-0042'", timeout_s=600, memory_mb=8000)
 
 
-def drift_first(root: Path) -> None:
+def drift(root: Path) -> None:
     from fieldcal.trends.drift_table import update_drift
 
-    with timed("drift, nothing remembered"):
-        update_drift(root)
+    update_drift(root)
 
 
-def drift_again(root: Path) -> None:
-    from fieldcal.trends.drift_table import update_drift
-
-    new_session(root)
-    with timed("drift after one session"):
-        update_drift(root)
-
-
-def pooled_first(root: Path) -> None:
+def pooled(root: Path) -> None:
     from fieldcal.trends.pooled.table import update_pooled
 
-    with timed("pooled, nothing remembered"):
-        update_pooled(root)
+    update_pooled(root)
 
 
-def pooled_again(root: Path) -> None:
-    from fieldcal.trends.pooled.table import update_pooled
+def site(root: Path) -> None:
+    from fieldcal.report.fitness import Criteria
+    from fieldcal.site import write_site
 
+    write_site(root, Criteria())
+
+
+def first(make: Callable[[Path], None], root: Path) -> None:
+    with timed(f"{make.__name__}, nothing remembered"):
+        make(root)
+
+
+def again(make: Callable[[Path], None], root: Path) -> None:
     new_session(root)
-    with timed("pooled after one session"):
-        update_pooled(root)
+    with timed(f"{make.__name__} after one session"):
+        make(root)
 
 
 def check(root: Path) -> None:
@@ -287,27 +287,6 @@ def standing(root: Path) -> None:
 
     with timed("who is fine to fly"):
         fleet_fitness(Snapshot(root), Criteria(), datetime.now(UTC))
-
-
-def site_first(root: Path) -> None:
-    from fieldcal.report.fitness import Criteria, fleet_fitness
-    from fieldcal.site.snapshot import Snapshot
-    from fieldcal.site.write import write_pages
-
-    with timed("the site, nothing written yet"):
-        snapshot = Snapshot(root)
-        write_pages(snapshot, fleet_fitness(snapshot, Criteria(), datetime.now(UTC)))
-
-
-def site_again(root: Path) -> None:
-    from fieldcal.report.fitness import Criteria, fleet_fitness
-    from fieldcal.site.snapshot import Snapshot
-    from fieldcal.site.write import write_pages
-
-    new_session(root)
-    with timed("the site after one session"):
-        snapshot = Snapshot(root)
-        write_pages(snapshot, fleet_fitness(snapshot, Criteria(), datetime.now(UTC)))
 
 
 def plan(root: Path) -> None:
@@ -360,12 +339,11 @@ def remembered(root: Path) -> None:
 
 
 LINES: dict[str, Callable[[Path], None]] = {
-    one.__name__: one
-    for one in (
-        questions, latest, latest_of_one, check, drift_first, drift_again, pooled_first, pooled_again, standing, plan,
-        site_first, site_again,
-    )
-}  # fmt: skip
+    **{one.__name__: one for one in (questions, latest, latest_of_one, check)},
+    **{f"{make.__name__}_{how.__name__}": partial(how, make) for make in (drift, pooled) for how in (first, again)},
+    **{one.__name__: one for one in (standing, plan)},
+    **{f"{site.__name__}_{how.__name__}": partial(how, site) for how in (first, again)},
+}
 
 
 @contextmanager

@@ -343,6 +343,11 @@ class Configuration:
         return self.document.alerts
 
     @property
+    def largest_gb(self) -> float | None:
+        """Size that nights hold the warehouse to; None for no limit."""
+        return self.document.warehouse.largest_gb
+
+    @property
     def writes_site(self) -> bool:
         """Whether each night writes the site."""
         return self.document.site.write

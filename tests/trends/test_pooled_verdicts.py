@@ -6,6 +6,7 @@ from __future__ import annotations
 import datetime as dt
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +53,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Truth]]:
     for vehicle in range(VEHICLES):
         rng = np.random.default_rng([5, vehicle])
         truths.append(Truth(rng, SESSIONS))
-        of_vehicle = lambda session, at, vehicle=vehicle: moved(vehicle, session, at)  # noqa: E731
-        publish_unit(root, vehicle, rng, truths[-1], SESSIONS, lambda session: 30, moved=of_vehicle)
+        publish_unit(root, vehicle, rng, truths[-1], SESSIONS, lambda session: 30, moved=partial(moved, vehicle))
     update_drift(root)
     return root, truths
 

@@ -52,11 +52,11 @@ class Removable:
 def former_results(root: Path) -> Removable:
     """Executions of stages that no row of the history comes from: of settings, code or logs of before."""
     named = set(Warehouse(root).scan("run").select("run_key").drop_nulls().unique().collect()["run_key"].to_list())
-    former = [folder for folder in _executions(root) if folder.name not in named]
+    former = [folder for folder in executions(root) if folder.name not in named]
     return Removable(
         "results of stages by former settings, code or logs",
         "nothing that the history has; a setting that is changed back runs its stages again",
-        tuple(path for folder in former for path in _files(folder)),
+        tuple(path for folder in former for path in files_below(folder)),
     )
 
 
@@ -65,7 +65,7 @@ def all_results(root: Path) -> Removable:
     return Removable(
         "results of all stages",
         "nothing that the history has; the next night runs all stages of all logs again",
-        tuple(_files(root / "stages")),
+        tuple(files_below(root / "stages")),
     )
 
 
@@ -76,7 +76,7 @@ def signals_before(root: Path, moment: datetime) -> Removable:
     return Removable(
         f"readings of {len(old)} flights before {moment:%Y-%m-%d}",
         "their Parquet readings and curves on their pages; their logs are read again where a stage has to run again",
-        tuple(path for path in _all_signals(root) if signal_ids(path)[1] in old),
+        tuple(path for path in all_signals(root) if signal_ids(path)[1] in old),
     )
 
 
@@ -90,11 +90,11 @@ def of_vehicle(root: Path, vehicle_id: str) -> Removable:
     """
     flights = Warehouse(root).scan("flight", vehicle_id=vehicle_id).select("flight_id").collect()["flight_id"].to_list()
     tables = [path for table in HISTORY_TABLES if (path := history_path(root, table, vehicle_id)).exists()]
-    signals = [path for path in _all_signals(root) if signal_ids(path)[0] == vehicle_id]
+    signals = [path for path in all_signals(root) if signal_ids(path)[0] == vehicle_id]
     if not tables and not signals:
         raise FieldcalError(ReasonCode.NOT_FOUND, f"Nothing of a vehicle {vehicle_id!r} is in {root}.")
     own = {encode_id(flight_id) for flight_id in flights}
-    stages = [path for folder in _executions(root) if folder.parent.name in own for path in _files(folder)]
+    stages = [path for folder in executions(root) if folder.parent.name in own for path in files_below(folder)]
     return Removable(
         f"all of vehicle {vehicle_id}: {len(flights)} flights",
         "its history, decisions and exports for good; its flights come back if a night finds their logs",
@@ -127,17 +127,18 @@ def _remove(root: Path, one: Removable) -> None:
         _remove_empty(beside.parent, root)
 
 
-def _executions(root: Path) -> Iterator[Path]:
+def executions(root: Path) -> Iterator[Path]:
+    """Folders of the cache of stages, one an execution."""
     yield from (folder for folder in sorted((root / "stages").glob("*/*/*")) if folder.is_dir())
 
 
-def _all_signals(root: Path) -> Iterator[Path]:
+def all_signals(root: Path) -> Iterator[Path]:
     """Of every table, further units' too."""
     tables = sorted(path.name for path in (root / "signals").glob("*") if path.is_dir())
     yield from (path for table in tables for path in signal_files(root, table))
 
 
-def _files(folder: Path) -> Iterator[Path]:
+def files_below(folder: Path) -> Iterator[Path]:
     """The record of an execution first: without it the rest counts for nothing."""
     yield from sorted((path for path in folder.rglob("*") if path.is_file()), key=lambda path: path.name != "run.json")
 

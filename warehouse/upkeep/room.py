@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fieldcal.warehouse.layout import checksum_path, encode_id
 from fieldcal.warehouse.query import Warehouse
-from fieldcal.warehouse.upkeep.prune import Removable
+from fieldcal.warehouse.upkeep.prune import Removable, all_signals, executions, files_below
 
 SPARE = 0.05
 """Of the limit: so much more is removed, so that not every night has to."""
@@ -46,7 +46,7 @@ def excess(root: Path, limit_bytes: float, *, readings: bool = True) -> Excess |
     readings
         Whether readings may go beside results of stages.
     """
-    size = sum(size for _, size in _files(root))
+    size = sum(map(_size, _below(root)))
     if size <= limit_bytes:
         return None
     ids = ("vehicle_id", "flight_id")
@@ -58,9 +58,9 @@ def excess(root: Path, limit_bytes: float, *, readings: bool = True) -> Excess |
     for vehicle_id, flight_id in flights.iter_rows():
         if left <= limit_bytes * (1.0 - SPARE):
             break
-        if own := of_flight.get((encode_id(vehicle_id), encode_id(flight_id))):
-            going += [path for path, _ in own]
-            left -= sum(size for _, size in own)
+        if own := of_flight.get(encode_id(flight_id)):
+            going += own
+            left -= sum(_size(path) + _size(checksum_path(root, path)) for path in own)
             whose[flight_id] = vehicle_id
     what = "readings and results of stages" if readings else "results of stages"
     removable = Removable(
@@ -71,31 +71,18 @@ def excess(root: Path, limit_bytes: float, *, readings: bool = True) -> Excess |
     return Excess(removable, whose, size, left)
 
 
-def _by_flight(root: Path, readings: bool) -> dict[tuple[str, str], list[tuple[Path, int]]]:
-    """Names of a vehicle's and a flight's folder → files with sizes, an execution's record before what it lists."""
-    found: dict[str, list[tuple[Path, int]]] = defaultdict(list)
-    for path, size in _files(root / "stages"):
-        found[path.relative_to(root / "stages").parts[1]].append((path, size))
-    by_flight: dict[tuple[str, str], list[tuple[Path, int]]] = defaultdict(list)
-    vehicles: dict[str, str] = {}
-    rows = Warehouse(root).scan("flight").select("vehicle_id", "flight_id").collect()
-    for vehicle_id, flight_id in rows.iter_rows():
-        vehicles[encode_id(flight_id)] = encode_id(vehicle_id)
-    for flight, files in found.items():
-        if flight in vehicles:
-            own = sorted(files, key=lambda file: file[0].name != "run.json")
-            by_flight[vehicles[flight], flight] += own
-    for path, size in _files(root / "signals") if readings else ():
-        beside = checksum_path(root, path)
-        by_flight[path.parent.name.partition("=")[2], path.stem].append((path, size + _size(beside)))
-    return by_flight
+def _by_flight(root: Path, readings: bool) -> dict[str, list[Path]]:
+    """Name of a flight's folder → its files, an execution's record before what it lists."""
+    found: dict[str, list[Path]] = defaultdict(list)
+    for folder in executions(root):
+        found[folder.parent.name] += files_below(folder)
+    for path in all_signals(root) if readings else ():
+        found[path.stem].append(path)
+    return found
 
 
-def _files(folder: Path) -> Iterator[tuple[Path, int]]:
-    for place, _, names in os.walk(folder):
-        for name in names:
-            path = Path(place) / name
-            yield path, _size(path)
+def _below(folder: Path) -> Iterator[Path]:
+    yield from (Path(place) / name for place, _, names in os.walk(folder) for name in names)
 
 
 def _size(path: Path) -> int:

@@ -14,7 +14,7 @@ from fieldcal.words.talk import say
 def make_room(night: Night) -> None:
     """Remove, of the flights that flew longest ago, what is beyond the limit, and say so. Nights do not make it again
     until a setting, the code or the log is another. By URL readings stay: they are the store's."""
-    limit_gb = night.configuration.document.warehouse.largest_gb
+    limit_gb = night.configuration.largest_gb
     if limit_gb is None:
         return
     with fleet_lock(night.root):
