@@ -167,3 +167,14 @@ def test_a_warehouse_is_held_to_its_size_and_no_night_makes_again_what_went(
     assert night(fleet) == (4, 0), "nothing is made again"
     make_room(plan_night(fleet / "archive", root))
     assert capsys.readouterr().err == "", "there is room to spare"
+
+
+def test_where_nothing_may_go_the_size_alone_is_told(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root, config = fleet / "data", fleet / "archive" / "fieldcal.toml"
+    config.write_text(config.read_text() + "\n[warehouse]\nlargest_gb = 1e-6\n")
+    make_room(plan_night(fleet / "archive", root))
+    assert "of the 4 flights" in capsys.readouterr().err
+    make_room(plan_night(fleet / "archive", root))
+    told = capsys.readouterr().err
+    assert "give it more" in told
+    assert "flights" not in told

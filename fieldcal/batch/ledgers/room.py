@@ -25,8 +25,9 @@ def make_room(night: Night) -> None:
         whole = ledger.as_they_were(found.flights)
         remove(night.root, found.removable)
         ledger.let_go(whole)
-    told = f"The warehouse was {found.size_bytes / 1e9:.2f} GB, largest_gb is {limit_gb:g}"
-    gone = f"removed were {found.removable.what}. Lost is {found.removable.lost}."
+    told = [f"The warehouse was {found.size_bytes / 1e9:.2f} GB, largest_gb is {limit_gb:g}."]
+    if found.flights:
+        told.append(f"Removed were {found.removable.what}. Lost is {found.removable.lost}.")
     if found.left_bytes > limit_gb * 1e9:
-        gone += f" {found.left_bytes / 1e9:.2f} GB are history, pages and records, which stay: give it more."
-    say(f"{told}: {gone}")
+        told.append(f"{found.left_bytes / 1e9:.2f} GB are history, pages and records, which stay: give it more.")
+    say(" ".join(told))
