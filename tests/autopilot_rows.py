@@ -42,6 +42,7 @@ def origin(
         "gravity_sign": "specific_force",
         "rotation_body_from_sensor": NOT_TURNED,
         "horizontal_field_g": None,
+        "horizontal_share": None,
         "loaded": {} if device_id is None else {sensor: loaded},
         **changes,
     }

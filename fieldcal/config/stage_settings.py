@@ -316,7 +316,7 @@ class ChoiceSettings(Axes, NominalScale):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompositionSettings(Axes, LocalField):
+class CompositionSettings(Axes, LocalField, FieldOrigin):
     """Stage `composition`."""
 
     applied_matrix: Mapping[Sensor, Rotation | None]

@@ -138,6 +138,8 @@ class Origin:
         Of the flight, °C: that of a zero whose slope is not known.
     horizontal_field_g : float or None
         North and east of the local field, gauss; None where its strength is not known.
+    horizontal_share : float or None
+        The same as a share of the field; None where its dip is not known either.
 
     Examples
     --------
@@ -151,6 +153,7 @@ class Origin:
     rotation_body_from_sensor: Rotation = NOT_TURNED
     temperature_degc: float | None = None
     horizontal_field_g: float | None = None
+    horizontal_share: float | None = None
 
 
 @dataclass(frozen=True)

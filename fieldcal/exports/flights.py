@@ -90,7 +90,15 @@ def origin_of(told: Mapping[str, Any], sensor: str, temperature_degc: float | No
     if own is not None:
         loaded = Loaded(own["autopilot"], own["device_id"], _rotation(own["rotation"]), own["parameters"])
     turn = _rotation(told["rotation_body_from_sensor"])
-    return Origin(loaded, told["body"], told["gravity_sign"], turn, temperature_degc, told["horizontal_field_g"])
+    return Origin(
+        loaded,
+        told["body"],
+        told["gravity_sign"],
+        turn,
+        temperature_degc,
+        told["horizontal_field_g"],
+        told.get("horizontal_share"),  # not kept at first
+    )
 
 
 def _rotation(rows: list[list[float]]) -> Rotation:

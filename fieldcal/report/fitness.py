@@ -157,11 +157,11 @@ def _flown(warehouse: Warehouse, vehicle: str) -> Flown:
     except FieldcalError:
         return Flown(exported, (), None)
     origin = constants.origins.get(Sensor.MAGNETOMETER)
-    field_g = None if origin is None else origin.horizontal_field_g
+    field = (None, None) if origin is None else (origin.horizontal_field_g, origin.horizontal_share)
     try:
-        return Flown(exported, compared(constants)[0], field_g)
+        return Flown(exported, compared(constants)[0], *field)
     except FieldcalError:  # no autopilot's
-        return Flown(exported, (), field_g)
+        return Flown(exported, (), *field)
 
 
 def _moving(rows: list[DriftRow]) -> Iterator[Reason]:

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import polars as pl
 
-from fieldcal.geometry.earth_field import UNIT_IN_TESLA
+from fieldcal.geometry.earth_field import UNIT_IN_TESLA, dip_rad
 from fieldcal.geometry.rotation import Array
 from fieldcal.geometry.sensor_model import through
-from fieldcal.names import RESIDUAL, SENSORS, Json, Status
+from fieldcal.names import FIELD_ASSUMED, RESIDUAL, SENSORS, Json, Status
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.stages.inputs import Tables
+from fieldcal.stages.joint.beside import DIP
 from fieldcal.stages.joint.information import equations_of, kept, of_raw, rewritten
 from fieldcal.stages.results import ZERO_SLOPE, StageResult
 from fieldcal.stages.tables import AXES, CalibrationRow, calibration_rows
@@ -67,7 +68,7 @@ def compose(tables: Tables, s: CompositionSettings) -> StageResult:
         made["information"] = _information(tables["information"], s)
         published += made["information"].height
     measured: dict[str, Json] = {
-        ORIGIN: _origin(s),
+        ORIGIN: _origin(s, rows),
         PUBLISHED_ROWS: published,
         **({"composed": composed} if composed else {}),
     }
@@ -96,7 +97,7 @@ def _information(rows: pl.DataFrame, s: CompositionSettings) -> pl.DataFrame:
     return rewritten(rows, found)
 
 
-def _origin(s: CompositionSettings) -> dict[str, Json]:
+def _origin(s: CompositionSettings, rows: pl.DataFrame) -> dict[str, Json]:
     """What an export has to know of the readings: their axes and signs, and what an autopilot had loaded for them."""
     loaded = {str(sensor): asdict(own) for sensor in s.own_sensors if (own := s.loaded[sensor]) is not None}
     return {
@@ -104,6 +105,7 @@ def _origin(s: CompositionSettings) -> dict[str, Json]:
         "gravity_sign": s.gravity_sign,
         "rotation_body_from_sensor": s.rotation_body_from_sensor,
         "horizontal_field_g": _horizontal_field_g(s),
+        "horizontal_share": _horizontal_share(s, rows),
         "loaded": loaded,
     }
 
@@ -112,6 +114,14 @@ def _horizontal_field_g(s: CompositionSettings) -> float | None:
     """By what a compass points; None where the field's strength is not known."""
     tesla = UNIT_IN_TESLA.get(s.field_unit)
     return None if tesla is None else float(np.hypot(*s.field_ned[:2])) * tesla / UNIT_IN_TESLA["G"]
+
+
+def _horizontal_share(s: CompositionSettings, rows: pl.DataFrame) -> float | None:
+    """Of the local field: by the configured or modelled one, else by the dip that the flight showed; None without."""
+    if s.field_source != FIELD_ASSUMED:
+        return float(np.cos(dip_rad(np.array(s.field_ned))))
+    found = rows.filter(pl.col("parameter") == DIP, pl.col("status") == Status.OK).sort("sd")
+    return None if found.is_empty() else float(np.cos(found["value"][0]))
 
 
 def _not_known(rows: pl.DataFrame) -> pl.DataFrame:

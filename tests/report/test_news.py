@@ -156,7 +156,7 @@ def test_dates_and_sessions_follow_the_limits(young: Path) -> None:
     assert (narrow.standing, wide.standing) == (Standing.FINE, Standing.FINE)
     overdue = fitness(dt.datetime(2036, 1, 1, tzinfo=dt.UTC), gyroscope_degps=0.3)
     assert overdue.standing == Standing.LOOK
-    assert "may be 0.3 °/s off what was found last" in overdue.reasons[0]
+    assert "may be off what was found last by 0.3 °/s" in overdue.reasons[0]
     unknown = fitness(last, gyroscope_degps=0.001)
     assert "more sessions would tell" in unknown.reasons[0]
 

@@ -4,6 +4,7 @@ readings an autopilot's own formula turns into logged ones."""
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +13,16 @@ import pytest
 from ulog_support import combined, selection
 
 import fieldcal
-from fieldcal.config.configuration import parse
+from fieldcal.config.configuration import Alerts, Tolerances, parse
 from fieldcal.config.flight_settings import flight_settings
 from fieldcal.config.stage_settings import CompositionSettings
 from fieldcal.flows.run import run_night
 from fieldcal.logs.dataflash import write as dataflash
 from fieldcal.logs.ulog.write import Rows, write_ulog
-from fieldcal.names import SENSORS, Method, Sensor
+from fieldcal.names import FIELD_ASSUMED, SENSORS, Method, Sensor
+from fieldcal.report.fitness import Criteria, fleet_fitness
 from fieldcal.simulation.experiment import simulate
-from fieldcal.stages.composition import compose, in_log
+from fieldcal.stages.composition import ORIGIN, compose, in_log
 from fieldcal.stages.results import ZERO_SLOPE, triad_rows, zero_slope_rows
 from fieldcal.stages.tables import AXES, calibration_rows, constants
 
@@ -46,6 +48,7 @@ def settings(matrix: np.ndarray, offset: np.ndarray, *, known: bool = True) -> C
         gravity_sign="specific_force",
         field_ned=(0.2, 0.0, 0.45),
         field_unit="G",
+        field_source="configured",
         rotation_body_from_sensor=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
         loaded=dict.fromkeys(SENSORS),
     )
@@ -227,12 +230,36 @@ def test_a_night_over_an_autopilots_log_has_the_raw_sensors_constants(
     assert published >= 16
     residual = rows.filter(parameter="residual_zero", sensor="gyroscope")
     assert (residual["value"] - pl.Series(ZERO["gyroscope"][: len(residual)])).abs().max() > 0.01  # type: ignore[operator]
+    limits = Criteria(Alerts(expires_days=1e5, idle_days=1e5), Tolerances(heading_deg=2.0))
+    assert "2° of heading" in fleet_fitness(warehouse, limits, datetime.now(UTC))["v"].next
     exported = fieldcal.export(warehouse.calibration_at("v", 25.0), "json").text
     assert "residual" not in exported
     calibration = fieldcal.calibrate(log, config=archive / "fieldcal.toml")
     _, logged = calibration.recording.readings("gyroscope")
     _, z = fieldcal.apply(calibration.recording, calibration).readings["gyroscope"]
     np.testing.assert_allclose(z, calibration.gyroscope.apply(logged), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("source", "field", "dip", "share"),
+    [
+        ("configured", (0.2, 0.0, 0.45), 0.3, 0.2 / np.hypot(0.2, 0.45)),
+        (FIELD_ASSUMED, (1.0, 0.0, 0.0), 0.3, np.cos(0.3)),
+        (FIELD_ASSUMED, (1.0, 0.0, 0.0), None, None),
+    ],
+)
+def test_how_level_the_field_is_goes_by_the_known_one_else_by_the_dip_of_the_flight(
+    source: str, field: tuple[float, float, float], dip: float | None, share: float | None
+) -> None:
+    rows = rows_of(np.eye(3), np.zeros(3), Sensor.MAGNETOMETER)
+    own = rows.head(1).with_columns(parameter=pl.lit("dip"), value=pl.lit(dip, pl.Float64))
+    poorer = own.with_columns(value=pl.lit(1.2), sd=pl.lit(9.0))
+    if dip is not None:
+        rows = pl.concat([rows, poorer, own])
+    of = replace(settings(np.eye(3), np.zeros(3)), field_source=source, field_ned=field)
+    origin = compose({"calibration": rows}, of).measured[ORIGIN]
+    assert isinstance(origin, dict)
+    assert origin["horizontal_share"] == (None if share is None else pytest.approx(share))
 
 
 def test_the_settings_of_a_flight_know_nothing_of_an_autopilot_by_themselves() -> None:

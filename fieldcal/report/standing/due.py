@@ -22,6 +22,7 @@ from fieldcal.report.trend import DAY_S, predicted
 from fieldcal.schemas.reference import ENOUGH_SESSIONS, REFERENCE_DEGC
 from fieldcal.schemas.rows import DriftRow
 from fieldcal.words.measures import measure
+from fieldcal.words.numbers import number
 
 SURE_SD = 2.0
 FARTHEST_D = 3650
@@ -48,14 +49,23 @@ class Due:
 @dataclass(frozen=True)
 class Flown:
     """What a vehicle flies with, as far as it is known: by unit and sensor when it was exported; constants that its
-    autopilot has loaded beside the estimate; the horizontal field, gauss."""
+    autopilot has loaded beside the estimate; the horizontal field, gauss, and as a share of the field."""
 
     exported_at: Mapping[tuple[str, str], datetime]
     loaded: Sequence[Compared]
     horizontal_field_g: float | None
+    horizontal_share: float | None = None
 
 
 UNKNOWN = Flown({}, (), None)
+
+
+@dataclass(frozen=True, order=True)
+class Limit:
+    """By how much a zero may be off, in its unit, and as it is told."""
+
+    value: float
+    told: str
 
 
 def due_of(rows: Sequence[DriftRow], tolerances: Tolerances, flown: Flown, now: datetime) -> list[Due]:
@@ -68,7 +78,7 @@ def due_of(rows: Sequence[DriftRow], tolerances: Tolerances, flown: Flown, now: 
             best[place] = row
     found = list(_loaded(flown, tolerances, now))
     for row in best.values():
-        limit = limit_in(row["sensor"], row["unit"], tolerances, flown.horizontal_field_g)
+        limit = limit_in(row["sensor"], row["unit"], tolerances, flown)
         if limit is not None and row["value_at_25degc"] is not None:
             found.append(_due(row, limit, flown, now))
     far = datetime.max.replace(tzinfo=now.tzinfo)
@@ -88,41 +98,54 @@ def next_sentence(found: Sequence[Due]) -> str:
     return wanting[0].sentence if wanting else "By its trends it stays within its limits for ten years."
 
 
-def limit_in(sensor: str, unit: str, tolerances: Tolerances, horizontal_field_g: float | None = None) -> float | None:
+def limit_in(sensor: str, unit: str, tolerances: Tolerances, flown: Flown = UNKNOWN) -> Limit | None:
     """The limit of a sensor's zero in a unit; None where there is none, or it cannot be told in that unit."""
-    if sensor == Sensor.GYROSCOPE and tolerances.gyroscope_degps is not None:
-        return float(np.deg2rad(tolerances.gyroscope_degps)) if unit == "rad/s" else None
-    if sensor == Sensor.ACCELEROMETER and tolerances.accelerometer_mg is not None:
-        return 1e-3 * STANDARD_GRAVITY_MPS2 * tolerances.accelerometer_mg if unit in ("m/s^2", "m/s²") else None
+    return min(_limits(sensor, unit, tolerances, flown), default=None)
+
+
+def _limits(sensor: str, unit: str, tolerances: Tolerances, flown: Flown) -> Iterator[Limit]:
+    if sensor == Sensor.GYROSCOPE and tolerances.gyroscope_degps is not None and unit == "rad/s":
+        yield _limit(float(np.deg2rad(tolerances.gyroscope_degps)), unit)
+    if sensor == Sensor.ACCELEROMETER and tolerances.accelerometer_mg is not None and unit in ("m/s^2", "m/s²"):
+        yield _limit(1e-3 * STANDARD_GRAVITY_MPS2 * tolerances.accelerometer_mg, unit)
+    if sensor == Sensor.MAGNETOMETER:
+        yield from _magnetic_limits(unit, tolerances, flown)
+
+
+def _magnetic_limits(unit: str, tolerances: Tolerances, flown: Flown) -> Iterator[Limit]:
+    """In units of the local field ("norm") only what a zero does to the heading is known."""
     tesla = UNIT_IN_TESLA.get(unit)
-    if sensor != Sensor.MAGNETOMETER or tesla is None:
-        return None
-    limits = []
-    if tolerances.magnetometer_ut is not None:
-        limits.append(tolerances.magnetometer_ut * UNIT_IN_TESLA["uT"] / tesla)
-    if tolerances.heading_deg is not None and horizontal_field_g:
-        share = float(np.tan(np.deg2rad(tolerances.heading_deg)))
-        limits.append(share * horizontal_field_g * UNIT_IN_TESLA["G"] / tesla)
-    return min(limits, default=None)
+    if tolerances.magnetometer_ut is not None and tesla is not None:
+        yield _limit(tolerances.magnetometer_ut * UNIT_IN_TESLA["uT"] / tesla, unit)
+    horizontal = flown.horizontal_share if unit == "norm" else None
+    if tesla is not None and flown.horizontal_field_g is not None:
+        horizontal = flown.horizontal_field_g * UNIT_IN_TESLA["G"] / tesla
+    if tolerances.heading_deg is not None and horizontal:
+        turn = tolerances.heading_deg
+        yield Limit(float(np.tan(np.deg2rad(turn))) * horizontal, f"{number(turn)}° of heading")
+
+
+def _limit(value: float, unit: str) -> Limit:
+    return Limit(value, measure(value, None, unit))
 
 
 def _loaded(flown: Flown, tolerances: Tolerances, now: datetime) -> Iterator[Due]:
     """Zeros that an autopilot has loaded and that are off by more than their limit, in its own axes."""
     for one in flown.loaded:
-        limit = limit_in(one.sensor, one.unit, tolerances, flown.horizontal_field_g)
+        limit = limit_in(one.sensor, one.unit, tolerances, flown)
         off = one.estimate - one.flies_with
-        if one.parameter == "zero" and limit is not None and abs(off) > limit:
+        if one.parameter == "zero" and limit is not None and abs(off) > limit.value:
             sd = one.sd if np.isfinite(one.sd) else None
             told = (
                 f"{one.sensor} {one.axis}: what is loaded is {measure(-off, sd, one.unit)} off what is estimated; the"
-                f" limit is {measure(limit, None, one.unit)}."
+                f" limit is {limit.told}."
             )
             yield Due(one.unit_id, one.unit_id, one.sensor, one.axis, now, 0, True, told)
 
 
-def _due(row: DriftRow, limit: float, flown: Flown, now: datetime) -> Due:
+def _due(row: DriftRow, most: Limit, flown: Flown, now: datetime) -> Due:
     place = (row["unit_id"], row["imu_id"], row["sensor"], row["axis"])
-    about, allowed = f"{row['sensor']} {row['axis']}", measure(limit, None, row["unit"])
+    about, limit, allowed = f"{row['sensor']} {row['axis']}", most.value, most.told
     sd, more = row["sd"] or 0.0, max(ENOUGH_SESSIONS - (row["n_sessions"] or 0), 0)
     if sd * SURE_SD > limit:
         more = max(more, int(np.ceil((row["n_sessions"] or 1) * ((SURE_SD * sd / limit) ** 2 - 1.0))), 1)
@@ -145,7 +168,7 @@ def _due(row: DriftRow, limit: float, flown: Flown, now: datetime) -> Due:
     at = row["as_of"] + timedelta(days=float(days[passing[0]]))
     moves = measure(MONTH_D * slope, MONTH_D * slope_sd, row["unit"])
     open_yet = ", which more sessions would narrow" if abs(slope) < SURE_SD * slope_sd else ""
-    told = f"{about} moves by {moves} in 30 days{open_yet}: from then on it may be {allowed} off what {since}."
+    told = f"{about} moves by {moves} in 30 days{open_yet}: from then on it may be off what {since} by {allowed}."
     return Due(*place, at, 0, at <= now, told)
 
 
