@@ -1783,6 +1783,12 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "normal.parameters_right[:, GRADIENT] += weighted.reshape(-1, p).T @ residual.reshape(-1)",
         "1 → 2",
     ): _ANY_NEGATIVE,
+    (
+        "estimation.by_velocity.fit",
+        "",
+        "UNDAMPED_ITERATIONS, DAMPING = 8, 0.5  # of the levels, which may swing about where they belong",
+        "0.5 → 0.55",
+    ): _DOWN,
     ("estimation.joint.fit", "", "MAX_ITERATIONS = 50", "50 → 55"): _CONVERGED,
     ("estimation.joint.fit", "", "LARGEST_REVERSED_STEP_SHARE = 0.5", "0.5 → 0.55"): _DOWN,
     (

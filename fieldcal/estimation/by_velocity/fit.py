@@ -24,6 +24,7 @@ from fieldcal.estimation.by_velocity.equations import (
     rows_of,
     solve,
 )
+from fieldcal.estimation.by_velocity.known import LAG_S, known_beforehand
 from fieldcal.estimation.by_velocity.problem import (
     LARGEST_LAG_S,
     SMALLEST_LAG_S,
@@ -37,15 +38,13 @@ from fieldcal.estimation.by_velocity.problem import (
 )
 from fieldcal.estimation.by_velocity.start import attitudes, velocities_at_knots
 from fieldcal.estimation.by_velocity.strapdown import Grid, Integrated, grid_of, integrate
+from fieldcal.estimation.by_velocity.walk import walk_density
 from fieldcal.estimation.gyroscope.output_error import propagate_stretches
 from fieldcal.estimation.joint.problem import PriorConstants, Readings
 from fieldcal.estimation.joint.variance_components import COLOUR_S, LARGEST_COLOUR
-from fieldcal.estimation.segments import run_bounds
-from fieldcal.estimation.smoothing import fill, lattice
 from fieldcal.estimation.statistics import (
     huber_inflation,
     low_frequency_density,
-    power_density,
     robust_sigma,
     variance_by_blocks,
 )
@@ -60,15 +59,6 @@ from fieldcal.geometry.rotation import (
 )
 from fieldcal.reason_codes import ReasonCode
 
-# What is known of a receiver beforehand.
-LAG_S, LAG_SD_S = 0.12, 0.15
-ARM_SD_M = 0.5
-SMOOTHING_SD_S2 = 1e-3  # that of a mean over 0.15 s
-# Of a gyroscope's bias, as it warms: 0.05 °/s a minute.
-DRIFT_SD_RADPS2 = 1.5e-5
-DELAY_SD_S = 0.05  # of a magnetometer behind the gyroscope
-# Of the field's dip and declination where its place is known: a model's error and a vehicle's steel; elsewhere.
-FIELD_SD_RAD, UNKNOWN_FIELD_SD_RAD = 0.03, 0.5
 UNKNOWN_SD_MPS = 0.3  # of a velocity of which the receiver does not say
 LEAST_SD_MPS = 0.02
 FEWEST_EPOCHS, FEWEST_FIELDS = 50, 20  # readings of the magnetometer, with fewer it is left out
@@ -84,8 +74,6 @@ CONVERGED_SD, CONVERGED_LEVEL = 0.03, 0.03
 # it is 1 at least. Logarithm of the factor by which a level may change in an iteration.
 START_RATIO, LARGEST_LOG_STEP = 30.0, 1.5
 LEAST_TURN, LEAST_PUSH = 1e-10, 1e-8
-# Band in which readings are noise, not motion, Hz, and parts whose spectra are averaged, s.
-NOISE_HZ, SPECTRUM_S = (10.0, 40.0), 4.0
 LARGEST_TURN_RAD, LARGEST_LAG_STEP_S = 0.5, 0.05
 
 
@@ -232,10 +220,10 @@ class _Fit:
         self.state = State(q, velocities_at_knots(self.setting), values)
         self.signs: list[Array] = []
         self.damping, self.change = 1.0, np.inf
-        self.known, self.expected = self._prior(priors, field_known)
-        self.noise_turn = max(_walk(readings, readings.gyroscope, start["gyroscope"][0]), LEAST_TURN)
+        self.known, self.expected = known_beforehand(values, self.layout, priors, field_known=field_known)
+        self.noise_turn = max(walk_density(readings, readings.gyroscope, start["gyroscope"][0]), LEAST_TURN)
         assert readings.accelerometer is not None
-        self.noise_push = max(_walk(readings, readings.accelerometer, start["accelerometer"][0]), LEAST_PUSH)
+        self.noise_push = max(walk_density(readings, readings.accelerometer, start["accelerometer"][0]), LEAST_PUSH)
         field_variance = float(np.sum(self.setting.field**2)) * 0.05**2
         if with_field:
             field_variance *= float(np.mean(values["magnetometer"][:3] ** 2))
@@ -247,35 +235,6 @@ class _Fit:
     def _integrated(self, grid: Grid, values: Mapping[str, Array]) -> Integrated:
         triads = values["gyroscope"], values["drift"], values["accelerometer"]
         return integrate(grid, *triads, self.sign, self.middle_s)
-
-    def _prior(self, priors: Mapping[str, PriorConstants], field_known: bool) -> tuple[Array, Array]:
-        """Information (p, p) and expected values (p,) of the constants."""
-        p = max(columns.stop for columns in self.layout.values())
-        information, expected = np.zeros((p, p)), np.zeros(p)
-        for name, columns in self.layout.items():
-            if name in priors:
-                scale, bias, covariance = priors[name].scale, priors[name].bias, priors[name].covariance
-                if name == "magnetometer":
-                    jacobian = np.diag(np.r_[-1.0 / scale**2, -1.0 / scale])
-                    covariance = jacobian @ covariance @ jacobian.T
-                    scale, bias = 1.0 / scale, -bias / scale
-                expected[columns] = np.r_[scale, bias]
-                information[columns, columns] = np.linalg.inv(covariance)
-            elif name in TRIADS:
-                expected[columns] = self.state.values[name]
-        sd = FIELD_SD_RAD if field_known else UNKNOWN_FIELD_SD_RAD
-        for name, value, own_sd in (
-            ("drift", 0.0, DRIFT_SD_RADPS2),
-            ("field", 0.0, sd),
-            ("delay", 0.0, DELAY_SD_S),
-            ("lag", LAG_S, LAG_SD_S),
-            ("smoothing", 0.0, SMOOTHING_SD_S2),
-            ("arm", 0.0, ARM_SD_M),
-        ):
-            if name in self.layout:
-                at = np.arange(self.layout[name].start, self.layout[name].stop)
-                information[at, at], expected[at] = own_sd**-2, value
-        return information, expected
 
     def run(self) -> VelocityFit:
         rng = np.random.default_rng(0)
@@ -437,21 +396,6 @@ def _between(readings: Readings, at: Array) -> int:
         return 0
     given = np.isfinite(readings.magnetometer).all(axis=1)
     return int(np.sum(given & (readings.t > at[0]) & (readings.t < at[-1] - LARGEST_LAG_S)))
-
-
-def _walk(readings: Readings, logged: Array, scale: Array) -> float:
-    """Density of the random walk, (unit · s)²/s, that a triad's noise makes of its integral, mean of the axes: that of
-    its spectrum above the motion, by the longest stretch. 0 of a stretch that is too short."""
-    a, b = max(run_bounds(readings.segment), key=lambda bounds: bounds[1] - bounds[0])
-    known = a + np.flatnonzero(np.isfinite(logged[a:b]).all(axis=1))
-    if len(known) < 16:
-        return 0.0
-    index, interval_s = lattice(readings.t[known])
-    x = fill(index, logged[known] * scale)
-    frequency, density = power_density(x, interval_s, min(len(x), max(16, round(SPECTRUM_S / interval_s))))
-    low = min(NOISE_HZ[0], 0.5 * frequency[-1])
-    band = (frequency >= low) & (frequency <= max(NOISE_HZ[1], low))
-    return 0.5 * float(np.mean(np.median(density[band], axis=0)))
 
 
 def _diverged() -> EstimationError:

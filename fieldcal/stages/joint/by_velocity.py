@@ -11,8 +11,9 @@ import numpy as np
 import polars as pl
 
 from fieldcal.errors import UnusableFlight
-from fieldcal.estimation.by_velocity.fit import ARM_SD_M, UNKNOWN_FIELD_SD_RAD, VelocityFit, fit_by_velocity
+from fieldcal.estimation.by_velocity.fit import VelocityFit, fit_by_velocity
 from fieldcal.estimation.by_velocity.information import observed
+from fieldcal.estimation.by_velocity.known import ARM_SD_M, UNKNOWN_FIELD_SD_RAD
 from fieldcal.estimation.by_velocity.problem import LARGEST_LAG_S, SMALLEST_LAG_S, Epochs
 from fieldcal.estimation.joint.information import GAIN
 from fieldcal.estimation.joint.ladder import LEAST_TILT

@@ -128,6 +128,19 @@ def test_what_clipped_residuals_do_not_tell_is_in_every_sd(monkeypatch: pytest.M
     assert np.allclose(covariance[1], 4.0 * covariance[0], rtol=1e-9)
 
 
+def test_another_way_down_ends_at_the_same_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps of the levels that are longer or shorter, and a start that trusts the walks less."""
+    flight = short_flight("lively", 7)
+    plain = errors(flight, fitted(flight))
+    for changed in ({"DAMPING": 0.75}, {"START_RATIO": 100.0}):
+        with monkeypatch.context() as patch:
+            for name, value in changed.items():
+                patch.setattr(by_velocity, name, value)
+            for name, (error, sd) in errors(flight, fitted(flight)).items():
+                assert np.all(np.abs(error - plain[name][0]) < 0.1 * sd), (changed, name)
+                assert np.allclose(sd, plain[name][1], rtol=0.05)
+
+
 def test_attitude_is_that_of_the_flight() -> None:
     flight = short_flight("mission", 8)
     fit = fitted(flight)
