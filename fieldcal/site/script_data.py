@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import zlib
 
 from fieldcal.names import Json
 from fieldcal.words.printable import printable
 
+_LEVEL = 9
 _ESCAPES = str.maketrans({"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "'": "\\u0027"})
 
 
 def script(name: str, value: Json) -> bytes:
     """A script that hands `value` over as the data `name`: ASCII, and no character that HTML knows."""
     return f"fieldcalData({_literal(name)},{_literal(value)});\n".encode("ascii")
+
+
+def packed_script(name: str, value: Json) -> bytes:
+    """The same of much data, compressed: a third of its size. The page unpacks it when its figures are drawn."""
+    text = base64.b64encode(zlib.compress(json.dumps(value, allow_nan=False, separators=(",", ":")).encode(), _LEVEL))
+    return f'fieldcalPacked({_literal(name)},"{text.decode("ascii")}");\n'.encode("ascii")
 
 
 def shown(text: str | None) -> str:

@@ -20,7 +20,7 @@ from fieldcal.site.downloads import constants_files, figures_file
 from fieldcal.site.fleet_pages import FOOTER, constants_data, with_standing
 from fieldcal.site.flight_charts import SIGNALS, sections, wanted
 from fieldcal.site.pages import DATA, Frame, html
-from fieldcal.site.script_data import script, shown
+from fieldcal.site.script_data import packed_script, shown
 from fieldcal.site.snapshot import Snapshot
 from fieldcal.site.vehicle_charts import on_site
 from fieldcal.warehouse.questions import units_flown
@@ -88,7 +88,7 @@ def _flight(snapshot: Snapshot, vehicle_id: str, flight_id: str, links: Links) -
 
 
 def _files(stem: str, page: Page, charts: Charts, constants: list[Json]) -> dict[str, bytes]:
-    data = script(stem, {"title": shown(page.title), "constants": constants, "charts": charts.plain()})
+    data = packed_script(stem, {"title": shown(page.title), "constants": constants, "charts": charts.plain()})
     figures = figures_file(charts)
     download = f"{DATA}/{stem}.parquet"
     files = {f"{DATA}/{stem}.js": data} | ({} if figures is None else {download: figures})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import datetime as dt
 import hashlib
 import io
@@ -9,6 +10,7 @@ import json
 import os
 import re
 import shutil
+import zlib
 from concurrent.futures import Future, ProcessPoolExecutor
 from html.parser import HTMLParser
 from pathlib import Path
@@ -79,10 +81,11 @@ class Page(HTMLParser):
 def given(path: Path) -> Any:
     """What a script of data hands over."""
     text = path.read_text(encoding="ascii")
-    found = re.fullmatch(r"fieldcalData\((\".*?\"),(.*)\);\n", text, re.S)
+    found = re.fullmatch(r"fieldcal(Data|Packed)\((\".*?\"),(.*)\);\n", text, re.S)
     assert found
-    assert path.stem == json.loads(found[1])
-    return json.loads(found[2])
+    assert path.stem == json.loads(found[2])
+    value = json.loads(found[3])
+    return value if found[1] == "Data" else json.loads(zlib.decompress(base64.b64decode(value)))
 
 
 def stamps(root: Path) -> dict[str, tuple[int, int]]:

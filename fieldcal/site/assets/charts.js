@@ -402,11 +402,18 @@
   fieldcal.figure = (place, chart, download) => new Figure(place, chart, download);
 
   // A page's own figures, each drawn when it comes into sight.
-  const onPage = () => {
+  const onPage = async () => {
     const script = document.querySelector("script[data-page]");
     const places = [...document.querySelectorAll(".chart[data-chart]")];
     if (!script || !places.length) return;
-    const charts = new Map(fieldcal.data.get(script.dataset.page).charts.map((chart) => [chart.id, chart]));
+    let page;
+    try {
+      page = await fieldcal.load(script.dataset.page);
+    } catch (error) {
+      places.forEach((place) => place.append(`Its data are not there (${error.message}).`));
+      return;
+    }
+    const charts = new Map(page.charts.map((chart) => [chart.id, chart]));
     const download = document.querySelector(".all-figures a")?.getAttribute("href");
     const make = (place) => {
       if (place.childElementCount) return;

@@ -3,19 +3,37 @@
 "use strict";
 
 (() => {
-  const fieldcal = (window.fieldcal = { data: new Map(), waiting: new Map() });
+  const fieldcal = (window.fieldcal = { data: new Map(), waiting: new Map(), coming: new Map() });
 
   window.fieldcalData = (name, value) => {
     fieldcal.data.set(name, value);
-    (fieldcal.waiting.get(name) || []).forEach((resolve) => resolve(value));
+    (fieldcal.waiting.get(name) || []).forEach(([resolve]) => resolve(value));
     fieldcal.waiting.delete(name);
+  };
+
+  const unpacked = async (text) => {
+    if (!window.DecompressionStream) throw new Error("this browser is too old to unpack them");
+    const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+    return JSON.parse(await new Response(stream).text());
+  };
+
+  window.fieldcalPacked = (name, text) => {
+    const coming = unpacked(text).then((value) => {
+      fieldcalData(name, value);
+      return value;
+    });
+    fieldcal.coming.set(name, coming);
+    const waiting = fieldcal.waiting.get(name) || [];
+    coming.catch((error) => waiting.forEach(([, reject]) => reject(error)));
   };
 
   // The data of a page, also of another one: as a script, which pages opened from a disk may load.
   fieldcal.load = (name) =>
     new Promise((resolve, reject) => {
       if (fieldcal.data.has(name)) return resolve(fieldcal.data.get(name));
-      fieldcal.waiting.set(name, [...(fieldcal.waiting.get(name) || []), resolve]);
+      if (fieldcal.coming.has(name)) return fieldcal.coming.get(name).then(resolve, reject);
+      fieldcal.waiting.set(name, [...(fieldcal.waiting.get(name) || []), [resolve, reject]]);
       const script = document.createElement("script");
       script.src = `data/${encodeURIComponent(name)}.js`;
       script.onerror = () => reject(new Error(name));
