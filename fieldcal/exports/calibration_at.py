@@ -176,9 +176,8 @@ def _triad(rows: pl.DataFrame, at: float, *, scale_needed: bool) -> Triad | None
     def matrix(column: _Number) -> np.ndarray:
         return np.array([[_or_zero(found[("scale", n)][column]) if n else 0.0 for n in row] for row in names])
 
-    def vector(parameter: str, column: _Number, unknown: float = 0.0) -> np.ndarray:
-        values = [found[parameter, axis][column] for axis in AXES]
-        return np.array([unknown if v is None else v for v in values], dtype=float)
+    def vector(parameter: str, column: _Number) -> np.ndarray:
+        return np.array([found[parameter, axis][column] for axis in AXES], dtype=float)  # NaN where it is not known
 
     slope, square, cube = _zero_over_temperature(found, at)
     return Triad(
@@ -189,8 +188,8 @@ def _triad(rows: pl.DataFrame, at: float, *, scale_needed: bool) -> Triad | None
         zero_per_degc2=square,
         zero_per_degc3=cube,
         zero_per_degc_sd=_slope_sd([found["zero", axis] for axis in AXES]),
-        scale_sd=vector("scale", "sd", np.nan),
-        zero_sd=vector("zero", "sd", np.nan),
+        scale_sd=vector("scale", "sd"),
+        zero_sd=vector("zero", "sd"),
         unit=_calibrated_unit(found),
         logged_unit=str(found["zero", "x"]["unit"]),
         temperature_degc=at,

@@ -32,6 +32,15 @@ def test_of_some_parameters_is_the_marginal_of_the_estimate() -> None:
     np.testing.assert_allclose(np.linalg.inv(some.information), covariance, rtol=RTOL)
 
 
+def test_an_other_one_of_which_something_is_known_is_eliminated_whatever_else_is_not_known() -> None:
+    """Two beside each other, one by itself, two of which nothing is known: 2 − 1²/2 is left of the first."""
+    information = np.zeros((5, 5))
+    information[:2, :2] = [[2.0, 1.0], [1.0, 2.0]]
+    information[2, 2] = 3.0
+    some = NormalEquations(NAMES, np.zeros(5), np.array([1.0, 4.0, 0.0, 0.0, 0.0]), information).of(NAMES[:1])
+    assert (some.information[0, 0], some.right[0]) == (1.5, -1.0)
+
+
 def test_what_is_known_only_beside_an_unknown_other_is_not_known() -> None:
     """Three observations of five parameters say nothing of two of them alone, exactly."""
     found, _, _ = made(3)

@@ -177,6 +177,7 @@ def composed(case: Case, found: dict[Sensor, tuple[np.ndarray, np.ndarray]]) -> 
         gravity_sign="specific_force",
         field_ned=(0.2, 0.0, 0.45),
         field_unit="G",
+        field_source="configured",
         body="frd",
         rotation_body_from_sensor=NOT_TURNED,
         loaded=dict.fromkeys(SENSORS),

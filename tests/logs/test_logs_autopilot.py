@@ -28,6 +28,14 @@ def test_readings_of_one_stamp_stay_as_they_are() -> None:
     assert (joined.interpolated, joined.left_out, joined.outside) == (0, 0, 0)
 
 
+def test_one_sensor_without_a_reading_leaves_no_row_and_all_of_the_gyroscopes_are_outside() -> None:
+    t, values = np.arange(5), np.ones((5, 3))
+    for gyro, accel, outside in ((0, 5, 0), (5, 0, 5), (0, 0, 0)):
+        joined = join_on_gyroscope(t[:gyro], values[:gyro], t[:accel], values[:accel])
+        assert {len(column) for column in joined.columns.values()} == {0}
+        assert joined.outside == outside
+
+
 @pytest.mark.parametrize("order", [1, -1])
 def test_others_are_interpolated_within_the_recording(order: int) -> None:
     gyro_t, accel_t = np.arange(50) * 4 * MS, 10 * MS + np.arange(20) * 5 * MS

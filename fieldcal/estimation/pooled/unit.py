@@ -429,16 +429,22 @@ def _series(found: Pooled) -> list[Array]:
         others = found.chain.others(session).loosened(found.scatter)
         before, together = others.estimate(), (others + own).estimate()
         for place in range(len(found.names)):
-            combination = found.combination(place, warmth_degc)
-            (x, v), (x_others, v_others) = together.of(combination), before.of(combination)
-            if not np.isfinite(v):
-                continue
-            known = 1.0 / v_others if np.isfinite(v_others) else 0.0
-            information = 1.0 / v - known
-            if information > LEAST_SHARE / v:
-                value = (x / v - (x_others * known if known else 0.0)) / information
-                rows[place].append((float(day), warmth_degc, value, 1.0 / information))
+            if (said := said_beside(before, together, found.combination(place, warmth_degc))) is not None:
+                rows[place].append((float(day), warmth_degc, *said))
     return [np.array(own).reshape(-1, 4) for own in rows]
+
+
+def said_beside(before: Estimate, together: Estimate, combination: Array) -> tuple[float, float] | None:
+    """(value, variance) that a part says of a combination of the state by itself, from what is known without it and
+    with it; None where that is less than LEAST_SHARE of what is known."""
+    (x, v), (x_others, v_others) = together.of(combination), before.of(combination)
+    if not np.isfinite(v):
+        return None
+    known = 1.0 / v_others if np.isfinite(v_others) else 0.0
+    information = 1.0 / v - known
+    if information <= LEAST_SHARE / v:
+        return None
+    return (x / v - (x_others * known if known else 0.0)) / information, 1.0 / information
 
 
 def _within_sessions(found: Pooled) -> list[Array]:
@@ -454,12 +460,8 @@ def _within_sessions(found: Pooled) -> list[Array]:
         before, together = others.estimate(), (others + found.raw[k]).estimate()
         value, variance = np.full((2, len(found.names)), np.nan)
         for place in found.sloped:
-            combination = found.combination(place, flight.warmth_degc)
-            (x, v), (x_others, v_others) = together.of(combination), before.of(combination)
-            known = 1.0 / v_others if np.isfinite(v_others) else 0.0
-            if np.isfinite(v) and 1.0 / v - known > LEAST_SHARE / v:
-                variance[place] = 1.0 / (1.0 / v - known)
-                value[place] = (x / v - (x_others * known if known else 0.0)) * variance[place]
+            if (said := said_beside(before, together, found.combination(place, flight.warmth_degc))) is not None:
+                value[place], variance[place] = said
         if flight.session in last:
             warmth, other, other_variance = last[flight.session]
             for at in np.flatnonzero(np.isfinite(value) & np.isfinite(other)):

@@ -85,7 +85,7 @@ def _encoding(probe: bytes) -> tuple[str, int]:
             return encoding, len(mark)
     pairs = len(probe) // 2
     if pairs >= 8:
-        even, odd = probe[0 : 2 * pairs : 2].count(0), probe[1 : 2 * pairs : 2].count(0)
+        even, odd = probe[0::2].count(0), probe[1::2].count(0)
         if odd > 0.9 * pairs and not even:
             return "utf-16-le", 0
         if even > 0.9 * pairs and not odd:

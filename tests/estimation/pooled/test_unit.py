@@ -11,7 +11,16 @@ from pooled import NAMES, PER_DEGC, SCATTER, Truth, alarms, drawn, of_names
 from fieldcal.estimation.normal_equations import NormalEquations
 from fieldcal.estimation.pooled.chain import Known
 from fieldcal.estimation.pooled.strengths import Series, Strengths, innovations, strengths_of
-from fieldcal.estimation.pooled.unit import Flight, Kinds, Unit, contradiction, pool, strengths
+from fieldcal.estimation.pooled.unit import (
+    LEAST_SHARE,
+    Flight,
+    Kinds,
+    Unit,
+    contradiction,
+    pool,
+    said_beside,
+    strengths,
+)
 
 SESSIONS = 12
 KNOWN: Kinds = {
@@ -168,6 +177,43 @@ def test_a_slope_within_a_flight_is_one_of_the_constant() -> None:
     now = pool(Unit(flights, np.arange(3.0)), kinds).at()
     assert now.state[1] == pytest.approx(1e-3, rel=1e-6)
     assert now.covariance[1, 1] == pytest.approx(1.0 / 3e10, rel=1e-3)
+
+
+@pytest.mark.parametrize("others", [0.0, 5.0])
+@pytest.mark.parametrize("information", [1e-3, 1.0, 1e3])
+def test_what_a_part_says_by_itself_is_what_it_brought(others: float, information: float) -> None:
+    """`others` times as much is known without it, of another value."""
+    before = Known(np.diag([others * information]), np.array([others * information * 7.0]))
+    with_it = before + Known(np.diag([information]), np.array([information * 3.0]))
+    said = said_beside(before.estimate(), with_it.estimate(), np.ones(1))
+    assert said == (pytest.approx(3.0), pytest.approx(1.0 / information))
+
+
+@pytest.mark.parametrize(("share", "says"), [(0.9 * LEAST_SHARE, False), (1.1 * LEAST_SHARE, True)])
+@pytest.mark.parametrize("information", [1e-3, 1.0, 1e3])
+def test_a_part_that_brings_next_to_nothing_says_nothing(share: float, says: bool, information: float) -> None:
+    before = Known(np.diag([information * (1.0 - share)]), np.zeros(1))
+    with_it = Known(np.diag([information]), np.zeros(1))
+    assert (said_beside(before.estimate(), with_it.estimate(), np.ones(1)) is not None) == says
+
+
+def test_of_what_is_not_determined_no_part_says_anything() -> None:
+    nothing = Known.nothing(1).estimate()
+    assert said_beside(nothing, nothing, np.ones(1)) is None
+
+
+def test_flights_contribute_as_much_as_they_know() -> None:
+    """Of a constant that does not move: of what is known with a flight, the share that is not known without it."""
+    names = (("gyroscope", "zero", "x"),)
+    told = np.array([1.0, 2.0, 5.0]) * 1e6
+    flights = [
+        Flight(NormalEquations(names, np.zeros(1), np.zeros(1), np.diag([n])), k, 0.0) for k, n in enumerate(told)
+    ]
+    still = {("gyroscope", "zero"): Strengths(0.0, 0.0, 0.0)}
+    found = pool(Unit(tuple(flights), np.arange(3.0)), still).contributions()
+    np.testing.assert_allclose(found[:, 0], told / told.sum(), rtol=1e-6)
+    alone = pool(Unit(tuple(flights[:1]), np.arange(1.0)), still).contributions()
+    np.testing.assert_allclose(alone[:, 0], 1.0)
 
 
 def test_what_is_not_known_by_both_cannot_contradict() -> None:
