@@ -398,6 +398,12 @@ def test_motor_compensation_is_told(tmp_path: Path, flight: DataflashFlight) -> 
     assert f"In {len(flight.mag_us)} MAG messages a part for the motors" in sentence(summary, "already_corrected")
 
 
+def test_of_motors_nothing_is_said_where_no_magnetometer_was_logged(tmp_path: Path, flight: DataflashFlight) -> None:
+    write.write_dataflash(tmp_path / "a.bin", flight.messages()[:2], parameters=PARAMETERS)
+    _, summary = tables(tmp_path / "a.bin")
+    assert "motors" not in sentence(summary, "already_corrected")
+
+
 def test_batches_of_one_sensor_are_told_as_not_read(tmp_path: Path, flight: DataflashFlight) -> None:
     batch = write.Messages("ISBH", "QHBB", ("TimeUS", "N", "type", "instance"), flight.t_us[:7], {})
     write.write_dataflash(tmp_path / "a.bin", [*flight.messages(), batch], parameters=PARAMETERS)

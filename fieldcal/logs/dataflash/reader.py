@@ -177,7 +177,7 @@ class DataflashLog:
         batches = self._file.counts().get("ISBH", 0)
         if batches:
             said += f" The {batches} ISBH batches are of one sensor at a time, so that they are no IMU record."
-        compensated = signals.motors(self._magnetometers[0]) if self._magnetometers else 0
+        compensated = sum(map(signals.motors, self._magnetometers))
         if compensated:
             said += f" In {compensated} MAG messages a part for the motors (MOX, MOY, MOZ) had been added."
         return said
