@@ -225,7 +225,7 @@ def test_a_vps_whose_clock_begins_again_at_another_moment(tmp_path: Path) -> Non
     assert codes(summary) == ["clock_wrapped"]
 
 
-@pytest.mark.parametrize(("pause_s", "wraps"), [(599, True), (601, False)])
+@pytest.mark.parametrize(("pause_s", "wraps"), [(600, True), (601, False)])
 def test_a_pause_over_midnight(tmp_path: Path, pause_s: int, wraps: bool) -> None:
     true_s = np.r_[86_390:86_398, 86_397 + pause_s + np.arange(20)]
     frames, _ = read(tmp_path, lines([str(t % 86_400) for t in true_s.tolist()], readings(28)))
