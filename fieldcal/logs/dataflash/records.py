@@ -93,7 +93,7 @@ def parse_fmt(message: bytes) -> Layout | None:
     if len(message) != FMT_BYTES or message[:HEAD_BYTES] != MARK + bytes([FMT_TYPE]):
         return None
     type_id, size = message[3], message[4]
-    name, letters, columns = (_text(message[a:b]) for a, b in ((5, 9), (9, 25), (25, 89)))
+    name, letters, columns = (_text(message[a:b]) for a, b in ((5, 9), (9, 25), (25, FMT_BYTES)))
     if not name or letters is None or columns is None or size < HEAD_BYTES:
         return None
     names = tuple(columns.split(",")) if columns else ()
