@@ -211,7 +211,8 @@ def test_what_is_said_of_the_units(tmp_path: Path, flight: DataflashFlight) -> N
     assert primary.rate_hz == pytest.approx(50.0, rel=0.01)
     further = source(summary, "accelerometer", "imu.1")
     assert (further.unit_id, further.device_id, further.primary) == ("instance-1", None, False)
-    assert source(summary, "magnetometer", "magnetometer").unit_id == "97539"
+    magnetometer = source(summary, "magnetometer", "magnetometer")
+    assert (magnetometer.unit_id, magnetometer.primary, magnetometer.filtered) == ("97539", True, False)
     assert "gyroscope 20 Hz, accelerometer 10 Hz" in sentence(summary, "already_corrected")
     assert "imu.1 (instance-1)" in sentence(summary, "further_units")
     assert not [f for f in summary.findings if f.loses_data or f.fatal]

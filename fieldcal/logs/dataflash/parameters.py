@@ -57,6 +57,11 @@ class Parameters:
             return default
         return history[max(bisect_right(history, at_ns, key=lambda change: change[0]) - 1, 0)][1]
 
+    def first(self, name: str, default: float = 0.0) -> float:
+        """The value with which the log begins; `default` where it has no such parameter."""
+        history = self._history.get(name)
+        return history[0][1] if history else default
+
     def triple(self, names: Triad, at_ns: int, default: float = 0.0) -> Triple:
         """The values of three axes that hold at `at_ns`."""
         x, y, z = (self.value(name, at_ns, default) for name in names)

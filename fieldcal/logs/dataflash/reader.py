@@ -170,7 +170,7 @@ class DataflashLog:
     def _advice(self, parameters: Parameters) -> str:
         said = ADVICE
         if self._imus and self._imus[0].fast is None:
-            limits = parameters.value("INS_GYRO_FILTER", 0), parameters.value("INS_ACCEL_FILTER", 0)
+            limits = parameters.first("INS_GYRO_FILTER"), parameters.first("INS_ACCEL_FILTER")
             said = (
                 f"IMU messages are low-passed too (gyroscope {limits[0]:g} Hz, accelerometer {limits[1]:g} Hz). {said}"
             )

@@ -56,7 +56,7 @@ def imus(file: DataflashFile, parameters: Parameters, malformed: dict[str, int])
     slow = signals.streams(file, "IMU", (*GYROSCOPE, *ACCELEROMETER), malformed)
     gyroscopes = signals.streams(file, "GYR", GYROSCOPE, malformed)
     accelerometers = signals.streams(file, "ACC", ACCELEROMETER, malformed)
-    options = int(parameters.value("INS_RAW_LOG_OPT", 0))
+    options = int(parameters.first("INS_RAW_LOG_OPT"))
     filtered = bool(options & POST_FILTER) and not options & PRE_AND_POST_FILTER
     units = []
     for instance, stream in slow.items():
@@ -66,7 +66,9 @@ def imus(file: DataflashFile, parameters: Parameters, malformed: dict[str, int])
             if all(_better(other, stream) for other in fast):
                 unit = Unit(stream, fast, filtered)
         units.append(unit)
-    return sorted(units, key=lambda unit: not parameters.value(inertial_names("GYR", unit.slow.instance).use, 0, 1.0))
+    return sorted(
+        units, key=lambda unit: not parameters.first(inertial_names("GYR", unit.slow.instance).use, default=True)
+    )
 
 
 def magnetometers(file: DataflashFile, parameters: Parameters, malformed: dict[str, int]) -> list[Stream]:
@@ -74,7 +76,7 @@ def magnetometers(file: DataflashFile, parameters: Parameters, malformed: dict[s
     found = signals.streams(file, "MAG", MAGNETOMETER, malformed).values()
     return sorted(
         (signals.by_sample(stream) for stream in found),
-        key=lambda stream: not parameters.value(compass_names(stream.instance).use, 0, 1.0),
+        key=lambda stream: not parameters.first(compass_names(stream.instance).use, default=True),
     )
 
 
@@ -167,17 +169,17 @@ def _tell_changed(unit: Unit, parameters: Parameters, summary: LogSummary, log_n
     """Finding on a primary IMU whose device id becomes another one while it is recorded."""
     name = inertial_names("GYR", unit.slow.instance).device_id
     changes = [at_ns for at_ns in parameters.changes_ns([name]) if at_ns > int(unit.slow.t_ns.min())]
-    if changes and parameters.value(name, 0):
+    if changes and parameters.first(name):
         summary.add(
             ReasonCode.UNIT_CHANGED,
             len(changes),
             f"{log_name}: {name} becomes {parameters.value(name, changes[-1]):.0f} within the recording, and was "
-            f"{parameters.value(name, 0):.0f}: the log is of two IMUs. Split it there.",
+            f"{parameters.first(name):.0f}: the log is of two IMUs. Split it there.",
         )
 
 
 def _identity(parameters: Parameters, name: str) -> int | None:
-    return int(parameters.value(name, 0)) or None
+    return int(parameters.first(name)) or None
 
 
 def _table(stem: str, number: int) -> str:
