@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-from prefect import Flow, flow
+from prefect import Flow, State, flow
 from prefect.states import Failed
 
 from fieldcal.batch.closing import close_night
@@ -120,20 +120,21 @@ def flow_of(
     watcher: Watcher | None,
     processes: Processes | None,
     keep: Callable[[NightDocument], None],
-) -> Flow[..., NightDocument]:
+) -> Flow[..., None]:
     """The flow of a night that was planned already, while the server started; `processes` wait for its batches.
 
-    `keep` gets the result too: the flow itself fails if Prefect cannot tell its server that it has ended.
+    `keep` gets the result: the flow itself fails if Prefect cannot tell its server that it has ended, and of what a
+    flow returns Prefect visits every value, of every log.
     """
 
     name = "nightly" if night.session is None else "session"
     about = printable(f"{(night.session or night.archive).resolve().name}, {datetime.now():%Y-%m-%d %H:%M}")
 
     @flow(name=name, flow_run_name=lambda: about, persist_result=False, validate_parameters=False)
-    def planned(folder: str, warehouse: str, workers: int, runner: str) -> NightDocument:
+    def planned(folder: str, warehouse: str, workers: int, runner: str) -> None:
         result = carry_out(night, parallel, watcher, processes)
         keep(result)
-        return told_apart(result)
+        return cast(None, failed_stages(result))
 
     return planned
 
@@ -174,13 +175,18 @@ def carry_out(
 
 def told_apart(result: NightDocument) -> NightDocument:
     """What a flow returns of its night: where stages failed a state that Prefect shows red, with what failed."""
+    return cast(NightDocument, failed_stages(result) or result)
+
+
+def failed_stages(result: NightDocument) -> State[Any] | None:
+    """The state of a night in which stages failed; None where none did."""
     failed = [log for log in result["logs"] if any(own["status"] == Status.FAILED for own in log["refusals"])]
     if not failed:
-        return result
+        return None
     first = f"{failed[0]['log_uri']}: {failed[0]['reason']}"
     more = f" … and {len(failed) - 1} more" if len(failed) > 1 else ""
     told = f"Stages of {len(failed)} of {len(result['logs'])} logs failed; the rest is published. {first}{more}"
-    return cast(NightDocument, Failed(message=printable(told)))
+    return Failed(message=printable(told))
 
 
 def _calibrate(

@@ -58,7 +58,7 @@ def run_night(
                 kept: list[NightDocument] = []
                 planned = flow_of(night, parallel, progress, processes, kept.append)
                 try:
-                    state: State[NightDocument] = cast(Any, planned)(
+                    state: State[None] = cast(Any, planned)(
                         str(session or archive), str(root), workers, runner, return_state=True
                     )
                     if not kept:

@@ -85,10 +85,11 @@ def plan_night(archive: Path, root: Path, config: Path | None = None, session: P
     source = find_source(config, archive)
     configuration = configuration_of(source)
     prepare(root)
-    remove_abandoned(root)
     forget_late(root)
     know_sources(root, keep=True)
     plan = make_plan(root, archive, configuration, session)
+    if plan.missing:  # every folder is looked into: too much for a night with nothing to do
+        remove_abandoned(root)
     write_ledger(root, [*plan.jobs, *plan.copied])
     return Night(archive, root, session, source, configuration, plan)
 

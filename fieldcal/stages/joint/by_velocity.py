@@ -38,11 +38,11 @@ from fieldcal.stages.joint.found import (
 )
 from fieldcal.stages.joint.information import table_of
 from fieldcal.stages.joint.judgement import (
-    INFORMED_SHARE,
     LARGEST_PRIOR_DISTANCE_SD,
     LEAST_MEAN_WEIGHT,
     MAX_DIP_DIFFERENCE_DEG,
     SCALE_ALONE,
+    informed,
     judged_scales,
 )
 from fieldcal.stages.results import StageResult, quantity_rows
@@ -174,9 +174,7 @@ def _judged(
             nominal_scale=s.nominal_scale[sensor],
             max_scale_sd=limit,
         )
-        told = np.sqrt(np.diagonal(covariance)[:3]) < INFORMED_SHARE * before[:3]
-        codes = [own or (None if told[i] else ReasonCode.SCALE_UNCERTAIN) for i, own in enumerate(codes)]
-        codes = [own or unseen[i] for i, own in enumerate(codes)]
+        codes = [own or unseen[i] for i, own in enumerate(informed(codes, covariance, prior))]
     return found_of(np.diag(scale), bias, covariance, None, codes, prior)
 
 

@@ -19,7 +19,7 @@ MAX_GYRO_NOISE_SHARE = 0.5
 # Constants known beforehand to less than this are held, not estimated; others that come out so many of their prior's sd
 # off contradict it, and show that something is not as the model has it.
 HELD_SD, LARGEST_PRIOR_DISTANCE_SD = 1e-4, 4.0
-# Refusals that concern the scale alone, and the share of a prior sd that a recording has to leave to have told a zero.
+# Refusals that concern the scale alone, and the share of a prior sd below which a recording has told a constant.
 SCALE_ALONE = (
     ReasonCode.SCALE_UNCERTAIN,
     ReasonCode.AXIS_NOT_TURNED,
@@ -83,6 +83,7 @@ def judged(
         return [ReasonCode.NOT_A_SPHERE] * 3
     noisy = axis_noise_share(fit) > MAX_GYRO_NOISE_SHARE if name == Sensor.GYROSCOPE else np.zeros(3, dtype=bool)
     codes = judged_scales(scale, covariance, polarity=polarity, nominal_scale=nominal_scale, max_scale_sd=max_scale_sd)
+    codes = informed(codes, covariance, prior)
     return [
         ReasonCode.AXIS_NOT_TURNED if noisy[i] and code != ReasonCode.SCALE_UNCERTAIN else code
         for i, code in enumerate(codes)
@@ -123,6 +124,17 @@ def judged_scales(
         else:
             out.append(None if 0.5 <= ratio <= 2.0 else ReasonCode.SCALE_NOT_NOMINAL)
     return out
+
+
+def informed(
+    codes: list[ReasonCode | None], covariance: Array, prior: PriorConstants | None
+) -> list[ReasonCode | None]:
+    """The same, refused too where the scale is hardly better known than before: what is published is the recording's,
+    not its prior."""
+    if prior is None:
+        return codes
+    share = np.sqrt(np.diagonal(covariance)[:3] / np.diagonal(prior.covariance)[:3])
+    return [own or (None if share[i] < INFORMED_SHARE else ReasonCode.SCALE_UNCERTAIN) for i, own in enumerate(codes)]
 
 
 def judged_zeros(
