@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 TURNED_DEG = "turned_deg"
 """Among what stage `manoeuvre` measured: `turned_within` about each axis, degrees."""
 LEAST_TURNED_DEG = 1.0
-"""A vehicle that turned by less within 10 s about every axis lay still; a manoeuvre in rad/s that is taken for °/s turns
-by more, and is told by its unit."""
+"""A vehicle that turned by less within 10 s about every axis lay still; a manoeuvre in rad/s that is taken for °/s
+turns by more, and is told by its unit."""
 SHORTEST_STRETCH = 10
 MAGNETOMETER_GAP_S = 0.1
 MAGNETOMETER_GAP_INTERVALS = 5.0
@@ -79,12 +79,13 @@ def find_manoeuvre(tables: Tables, s: ManoeuvreSettings) -> StageResult:
         "rate_threshold": found.threshold,
         "rate_noise": found.noise,
     }
-    unit = s.nominal_scale[Sensor.GYROSCOPE]
+    unit, still = s.nominal_scale[Sensor.GYROSCOPE], False
     if rate_or_none is not None and unit is not None:
         turned = motion_selection.turned_within(t, rate * np.asarray(unit), max_gap_s=s.manoeuvre_max_gap_s)
         measured[TURNED_DEG] = [float(angle) for angle in np.rad2deg(turned)]
+        still = bool(np.max(np.rad2deg(turned)) < LEAST_TURNED_DEG)
     too_short = found.excited_s < s.manoeuvre_min_s
-    if too_short or max(measured.get(TURNED_DEG, [LEAST_TURNED_DEG])) < LEAST_TURNED_DEG:
+    if too_short or still:
         wanting = (
             f"Only {found.excited_s:.1f} s of rotation were found, {s.manoeuvre_min_s:.0f} s are needed"
             if too_short
