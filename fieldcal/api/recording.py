@@ -168,7 +168,8 @@ def read_log(path: Path | str, *, config: Path | str | None = None, vehicle: str
         session are the folders it lies in, ``<vehicle>/<session>/<log>``. Or its URL (``s3://``, ``gs://``, ``az://``):
         it is fetched.
     config : Path or str, optional
-        A fieldcal.toml: topics, columns, units. Otherwise the one in the folder above the vehicle's, if there is one.
+        A fieldcal.toml: topics, columns, units. Otherwise the one in the folder above the vehicle's, beside
+        the log or in the current directory.
     vehicle : str, optional
         Another vehicle of the configuration than the folder says.
 

@@ -11,7 +11,7 @@ from fieldcal.cli.options import AsJson, Config, Place, UnusedConfig, UnusedRoot
 from fieldcal.words.printable import printable
 
 if TYPE_CHECKING:
-    from fieldcal.flight.inspection import Inspection
+    from fieldcal.flight.inspection import Inspection, UnitOnBoard
 
 OK, LOSSES = 0, 3
 WIDTH = 80
@@ -83,6 +83,8 @@ def screen(found: Inspection) -> Iterator[str]:
     """The lines for people, at most 80 wide unless a single word is wider."""
     name = Path(found.path).name
     yield from _told("log", f"{name} ({found.log_format}, {_size(found.size_bytes)}), vehicle {found.vehicle_id}")
+    if found.configuration is not None:
+        yield f"{'by':{LABEL}}{found.configuration}"  # in one piece, as it can be copied
     yield from _told("verdict", found.verdict + (f": {found.reason}" if found.reason else ""))
     for finding in found.findings:
         if finding["sentence"] != found.reason:
@@ -114,6 +116,9 @@ def screen(found: Inspection) -> Iterator[str]:
         yield from _told(
             "on board", f"{unit.sensor} {unit.unit_id} ({unit.stream}, {rate} Hz): {kind}{filtered}{corrected}"
         )
+    for unit in found.units_on_board:
+        if unit.primary and unit.corrected:
+            yield from _told("applied", _applied(unit))
     frames = ", ".join(f"{one.key} {one.value} ({one.value_from})" for one in found.conventions)
     yield from _told("frames", frames)
     if (field := found.field_used) is not None:
@@ -129,6 +134,16 @@ def screen(found: Inspection) -> Iterator[str]:
         yield ""
         yield vehicle_header(found.vehicle_id)
         yield from found.settings
+
+
+def _applied(unit: UnitOnBoard) -> str:
+    values = ", ".join(
+        f"{name} {value:.{0 if value.is_integer() else 6}{'f' if value.is_integer() else 'g'}}"
+        for name, value in unit.parameters.items()
+        if not name.endswith("_ID")
+    )
+    changed = f"; changed {unit.changes} time(s) in the log" if unit.changes else ""
+    return f"{unit.sensor} {unit.unit_id}: {values or 'no parameter but such that are 0'}{changed}"
 
 
 def _told(label: str, text: str) -> list[str]:

@@ -112,12 +112,16 @@ def calibrate(
         Overrule a stage parameter: --set smoothing_cutoff_hz=6.
     """
     from fieldcal.cli.show import print_json
+    from fieldcal.flight.calibrate import configuration_file
+    from fieldcal.remote.url import is_url
     from fieldcal.words.talk import say
 
     changes = _assignments(set_ or [])
     result = fieldcal.calibrate(
         log, method=method, profile=profile, parameters=changes, config=config, vehicle=vehicle, unit=unit
     )
+    if config is None and not is_url(log) and (file := configuration_file(Path(log))) is not None:
+        say(f"Configuration: {file}")
     if report is not None:
         say(f"Report: {result.report(report)}")
     if as_json:
@@ -424,7 +428,7 @@ def _night(
             from fieldcal.cli.present.screen import console
 
             print_plan(console(wide=wide), plan)
-        return OK
+        return OK if plan["logs"] else _nothing(archive, folder)
     from fieldcal.cli.present.progress import NightProgress
 
     with NightProgress() as progress:
@@ -436,7 +440,20 @@ def _night(
         from fieldcal.cli.present.screen import console
 
         print_night(console(wide=wide), result, root)
+    if not result["logs"]:
+        return _nothing(archive, folder)
     return OK if result["ok"] == len(result["logs"]) else LOSSES
+
+
+def _nothing(archive: Path, folder: Path | None) -> int:
+    import shlex
+
+    return _told(
+        f"{folder or archive} holds nothing that is a log: logs lie as <vehicle>/<session>/<log>, others are named in "
+        f"archive.logs. fieldcal doctor --archive {shlex.quote(str(archive))} names what lies there; fieldcal init "
+        "writes archive.logs for logs that lie elsewhere.",
+        LOSSES,
+    )
 
 
 def _root(warehouse: str | None) -> Path:

@@ -34,6 +34,13 @@ def find_source(config: Path | None, archive: Path | None) -> Source:
     return {"path": str(path), "text": path.read_bytes().decode("utf-8-sig")}
 
 
+def find_near(log: Path, archive: Path) -> Path | None:
+    """A single log's configuration: its archive's own as in a night, else the one beside or in the log, else the one in
+    the current directory."""
+    near = (folder / CONFIG_NAME for folder in (archive, log, log.parent, Path.cwd()))
+    return next((path for path in near if path.is_file()), None)
+
+
 def configuration_of(source: Source) -> Configuration:
     """The configuration from its source."""
     return parse(source["text"] or "", Path(source["path"]) if source["path"] else None)

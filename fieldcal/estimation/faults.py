@@ -146,7 +146,7 @@ def _dead(sensor: str, axis: str, x: Array, unit: str) -> Fault | None:
 def _stuck(sensor: str, axis: str, t: Array, x: Array, beside: Array, unit: str) -> Fault | None:
     """A value that is held for far longer than the channel holds values otherwise, unless the axes `beside` (n, 2) show
     a coarse sensor that lies still."""
-    start = run_starts(x)
+    start = _unbroken_starts(t, x)
     end = np.r_[start[1:], len(x)] - 1
     held = t[end] - t[start]
     usual = float(np.quantile(np.sort(held)[: max(1, len(held) - HOLDS_LEFT_OUT)], 0.99))
@@ -165,6 +165,13 @@ def _stuck(sensor: str, axis: str, t: Array, x: Array, beside: Array, unit: str)
         f" ({100 * share:.1f} % of the recording in all) where it else changes within {usual:.3g} s: it was stuck."
     )
     return Fault(sensor, axis, ReasonCode.STUCK, share, STUCK_SHARE, share > STUCK_SHARE, sentence)
+
+
+def _unbroken_starts(t: Array, x: Array) -> Array:
+    """Where runs of one value begin; none runs on through a pause: nobody knows what was there meanwhile."""
+    interval = np.diff(t)
+    pause = interval > max(STUCK_S, DROPOUT_INTERVALS * float(np.median(interval)))
+    return np.union1d(run_starts(x), np.flatnonzero(pause) + 1)
 
 
 def resolution(x: Array) -> float:

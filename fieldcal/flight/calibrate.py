@@ -7,8 +7,8 @@ from pathlib import Path
 
 import polars as pl
 
-from fieldcal.config.configuration import Configuration, Vehicle
-from fieldcal.config.find import CONFIG_NAME, configuration_of, find_source, with_parameters
+from fieldcal.config.configuration import Vehicle
+from fieldcal.config.find import configuration_of, find_near, find_source, with_parameters
 from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.errors import FieldcalError, unforeseen
 from fieldcal.flight.job import Job
@@ -51,13 +51,19 @@ class LogRead:
     facts: Facts
 
 
+def configuration_file(log: Path, config: Path | None = None) -> Path | None:
+    """The named `fieldcal.toml`, else the one at the archive's root, beside the log or in the current directory."""
+    log = log.absolute()
+    return config or find_near(log, log.parent.parent.parent)
+
+
 def identify(
     log: Path, config: Path | None = None, *, vehicle_id: str | None = None, session_id: str | None = None
 ) -> tuple[Job, Vehicle]:
     """What a log is and how its vehicle is configured.
 
     Vehicle and session are taken from the folders the log lies in, `<vehicle>/<session>/<log>`, unless given; the
-    configuration from `fieldcal.toml` above them, unless given.
+    configuration from the file that `configuration_file` names.
 
     Raises
     ------
@@ -68,7 +74,7 @@ def identify(
     """
     log = log.absolute()
     archive = log.parent.parent.parent
-    configuration = _configuration(config, archive)
+    configuration = configuration_of(find_source(configuration_file(log, config), None))
     vehicle_id = vehicle_id or log.parent.parent.name
     job = _job(log, vehicle_id, session_id or log.parent.name, archive)
     return job, configuration.vehicle(vehicle_id)
@@ -148,12 +154,6 @@ def _unit_of(log: LogRead, table: str, imu_id: str) -> Unit:
             ReasonCode.WRONG_OPTION, f"{log.job.log_uri} has no unit {table!r}; there is {', '.join(units)}."
         )
     return units[table]
-
-
-def _configuration(config: Path | None, archive: Path) -> Configuration:
-    """The named file, else `fieldcal.toml` at the archive's root."""
-    own = archive / CONFIG_NAME
-    return configuration_of(find_source(config or (own if own.is_file() else None), None))
 
 
 def _job(log: Path, vehicle_id: str, session_id: str, archive: Path) -> Job:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ import polars as pl
 from fieldcal.config.configuration import Vehicle
 from fieldcal.config.values import UNITS
 from fieldcal.errors import FieldcalError, UnreadableLog
-from fieldcal.flight.calibrate import identify
+from fieldcal.flight.calibrate import configuration_file, identify
 from fieldcal.logs import LogSummary, log_format, open_log
 from fieldcal.logs.discovery import folder_parts
 from fieldcal.logs.facts import Facts, FindingFacts
@@ -62,7 +62,10 @@ class Convention:
 
 @dataclass(frozen=True)
 class UnitOnBoard:
-    """One of several units that the log tells of (`logs.interface.SensorSource`)."""
+    """One of several units that the log tells of (`logs.interface.SensorSource`).
+
+    `parameters`: the autopilot's by which it had corrected the readings, as they stood at the end of the log, without
+    those that are 0; `changes`: how often they had changed since its start."""
 
     sensor: Sensor
     unit_id: str
@@ -71,6 +74,8 @@ class UnitOnBoard:
     primary: bool
     filtered: bool
     corrected: bool
+    parameters: dict[str, float] = field(default_factory=dict)
+    changes: int = 0
 
 
 @dataclass(frozen=True)
@@ -87,8 +92,9 @@ class FieldUsed:
 class Inspection:
     """What is in a log. Of one that is rejected only what stands before `findings` is known.
 
-    `would_do`: a sentence for each sensor and for the VPS. `settings`: lines of `[vehicles."<vehicle_id>"]` that state
-    what is unknown or assumed. As they stand they change nothing; edited, they do.
+    `configuration`: the fieldcal.toml that holds, None without one. `would_do`: a sentence for each sensor and for the
+    VPS. `settings`: lines of `[vehicles."<vehicle_id>"]` that state what is unknown or assumed. As they stand they
+    change nothing; edited, they do.
     """
 
     path: str
@@ -98,6 +104,7 @@ class Inspection:
     verdict: str
     reason_code: str | None
     reason: str | None
+    configuration: str | None = None
     findings: list[FindingFacts] = field(default_factory=list)
     duration_s: float | None = None
     started_at: str | None = None
@@ -122,7 +129,8 @@ def inspect_log(log: Path, config: Path | None = None) -> Inspection:
         `not_found`, `not_readable`: there is no such log.
     """
     job, vehicle = identify(log, config)
-    return inspect_as(Path(job.path), vehicle)
+    file = configuration_file(Path(job.path), config)
+    return replace(inspect_as(Path(job.path), vehicle), configuration=None if file is None else str(file))
 
 
 def inspect_as(path: Path, vehicle: Vehicle) -> Inspection:
@@ -223,8 +231,17 @@ def _conventions(facts: Facts, vehicle: Vehicle) -> Iterator[Convention]:
 
 def _on_board(source: SensorSource) -> UnitOnBoard:
     rate_hz = _finite(source.rate_hz)
+    applied = source.corrections[-1].parameters if source.corrections else {}
     return UnitOnBoard(
-        source.sensor, source.unit_id, source.stream, rate_hz, source.primary, source.filtered, source.corrected
+        source.sensor,
+        source.unit_id,
+        source.stream,
+        rate_hz,
+        source.primary,
+        source.filtered,
+        source.corrected,
+        {name: float(value) for name, value in applied.items() if value},
+        max(len(source.corrections) - 1, 0),
     )
 
 

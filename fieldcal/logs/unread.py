@@ -6,7 +6,7 @@ import os
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatch
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from fieldcal.logs.discovery import LOG_FORMATS, entries, is_stored, named_in_text, stays_inside
 
@@ -24,6 +24,9 @@ BESIDE_LOGS = (
     "thumbs.db",
 )
 """Names (in lower case) of what nobody takes for a log."""
+
+SESSION = 2
+"""Depth of a session's content below the archive."""
 
 UNKNOWN = "no known kind of log"
 UNKNOWN_FOLDER = "a folder that is no log"
@@ -52,15 +55,15 @@ def find_unread(archive: Path, log_uris: Collection[str], session: Path | None =
         The logs that `find_logs` found.
     """
     root = archive.resolve()
-    taken = {uri.rpartition("/")[0] for uri in log_uris}
+    holding = {str(folder) for uri in log_uris for folder in PurePosixPath(uri).parents}
     found = []
-    for path, depth in _walk(archive, root, set(log_uris)):
+    for path, depth in _walk(archive, root, set(log_uris), holding):
         uri = os.fsencode(path.relative_to(archive).as_posix()).decode("utf-8", "backslashreplace")
         if session is not None and not path.parent.resolve().is_relative_to(session.resolve()):
             continue
         if uri in log_uris or any(fnmatch(path.name.lower(), pattern) for pattern in BESIDE_LOGS):
             continue
-        if path.is_dir() and any(folder == uri or folder.startswith(uri + "/") for folder in taken):
+        if uri in holding and path.is_dir():
             continue
         why = _reason(path, root, depth)
         if why:
@@ -76,20 +79,23 @@ def told(unread: Collection[Unread], most: int = 5) -> str:
     return f"{len(unread)} {what} not read: {listed}{more}"
 
 
-def _walk(archive: Path, root: Path, log_uris: Collection[str]) -> Iterator[tuple[Path, int]]:
-    """Everything in the archive's folders as deep as a session's content, with its depth: 2 in a session."""
-    level = [archive]
-    for depth in range(3):
+def _walk(archive: Path, root: Path, log_uris: Collection[str], holding: Collection[str]) -> Iterator[tuple[Path, int]]:
+    """Everything in the archive's folders as deep as a session's content, with its depth: 2 in a session; deeper in
+    folders that hold logs."""
+    level, depth = [archive], 0
+    while level:
         content = [path for folder in level for path in entries(folder)]
-        yield from ((path, depth) for path in content if depth == 2 or not path.is_dir() or not _named(path))
+        yield from ((path, depth) for path in content if depth >= SESSION or not path.is_dir() or not _named(path))
         level = [
             path
             for path in content
             if stays_inside(path, root)
             and path.is_dir()
             and _named(path)
-            and path.relative_to(archive).as_posix() not in log_uris
+            and (uri := path.relative_to(archive).as_posix()) not in log_uris
+            and (depth < SESSION or uri in holding)
         ]
+        depth += 1
 
 
 def _named(path: Path) -> bool:
@@ -105,6 +111,4 @@ def _reason(path: Path, root: Path, depth: int) -> str | None:
         return NOT_STORED
     if path.is_dir():
         return UNKNOWN_FOLDER if entries(path) else None
-    if depth < 2:
-        return MISPLACED if path.name.lower().endswith(tuple(LOG_FORMATS)) else None
-    return UNKNOWN
+    return MISPLACED if depth != SESSION and path.name.lower().endswith(tuple(LOG_FORMATS)) else UNKNOWN

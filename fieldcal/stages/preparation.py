@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 TURNED_DEG = "turned_deg"
 """Among what stage `manoeuvre` measured: `turned_within` about each axis, degrees."""
+LEAST_TURNED_DEG = 1.0
+"""A vehicle that turned by less within 10 s about every axis lay still; a manoeuvre in rad/s that is taken for °/s
+turns by more, and is told by its unit."""
 SHORTEST_STRETCH = 10
 MAGNETOMETER_GAP_S = 0.1
 MAGNETOMETER_GAP_INTERVALS = 5.0
@@ -76,17 +79,23 @@ def find_manoeuvre(tables: Tables, s: ManoeuvreSettings) -> StageResult:
         "rate_threshold": found.threshold,
         "rate_noise": found.noise,
     }
-    unit = s.nominal_scale[Sensor.GYROSCOPE]
+    unit, still = s.nominal_scale[Sensor.GYROSCOPE], False
     if rate_or_none is not None and unit is not None:
         turned = motion_selection.turned_within(t, rate * np.asarray(unit), max_gap_s=s.manoeuvre_max_gap_s)
         measured[TURNED_DEG] = [float(angle) for angle in np.rad2deg(turned)]
-    if found.excited_s < s.manoeuvre_min_s:
+        still = bool(np.max(np.rad2deg(turned)) < LEAST_TURNED_DEG)
+    too_short = found.excited_s < s.manoeuvre_min_s
+    if too_short or still:
+        wanting = (
+            f"Only {found.excited_s:.1f} s of rotation were found, {s.manoeuvre_min_s:.0f} s are needed"
+            if too_short
+            else "It lay still, but for vibration"
+        )
         return StageResult(
             {"segments": segments.with_columns(used=pl.lit(False))},
             Status.REFUSED,
             ReasonCode.TOO_LITTLE_MOTION,
-            f"Only {found.excited_s:.1f} s of rotation were found, {s.manoeuvre_min_s:.0f} s are needed: fly the"
-            " manoeuvre (roll, pitch and yaw doublets).",
+            f"{wanting}: fly the manoeuvre (roll, pitch and yaw doublets).",
             measured,
         )
     return StageResult({"segments": segments}, measured=measured)

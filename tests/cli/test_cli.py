@@ -352,6 +352,19 @@ def test_mistakes_in_the_configuration_end_in_2(
     assert not (tmp_path / "w").exists()
 
 
+def test_an_archive_in_which_nothing_is_recognised_ends_in_3_with_the_next_step(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    unknown = tmp_path / "archive" / "v" / "s" / "flight.tlog"
+    unknown.parent.mkdir(parents=True)
+    unknown.write_bytes(b"x")
+    for tokens in (["nightly", str(tmp_path / "archive")], ["session", str(unknown.parent)]):
+        assert run([*tokens, "--dry-run", "--warehouse", str(tmp_path / "w")]) == 3
+        told = capsys.readouterr()
+        assert "v/s/flight.tlog (no known kind of log)" in told.out
+        assert "fieldcal doctor --archive" in told.err
+
+
 def test_no_warehouse_is_a_failure(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for command in (["history"], ["sql", "SELECT 1"], ["verify"]):
         assert "nightly" in sentence(capsys, *command, "--warehouse", str(tmp_path / "none"), code=1)

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ulog_support import GYRO_ID, parts_of
+from ulog_support import flight as ulog_flight
 
 import fieldcal
 from fieldcal.cli.main import run
@@ -169,6 +171,41 @@ def test_inspect_leaves_everything_as_it_was(capsys: pytest.CaptureFixture[str],
     before = {path: path.stat().st_mtime_ns for path in archive.rglob("*")}
     shown(capsys, "inspect", str(next(archive.rglob("*.mcap"))))
     assert {path: path.stat().st_mtime_ns for path in archive.rglob("*")} == before
+
+
+@pytest.mark.parametrize("place", ["archive", "beside", "current directory"])
+def test_a_configuration_near_the_log_holds_and_is_named(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, archive: Path, tmp_path: Path, place: str
+) -> None:
+    (log,) = archive.rglob("*.mcap")
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    assert document(capsys, log)["configuration"] is None
+    places = {"current directory": here, "beside": log.parent, "archive": archive}
+    for holder in places.values():  # each above the one before
+        (holder / CONFIG_NAME).write_text('[defaults]\nworld = "enu"\n')
+        if holder == places[place]:
+            break
+    file = places[place] / CONFIG_NAME
+    assert f"by        {file}" in shown(capsys, "inspect", str(log))
+    found = document(capsys, log)
+    assert found["configuration"] == str(file)
+    assert {"key": "world", "value": "enu", "value_from": "configuration"} in found["conventions"]
+    capsys.readouterr()
+    run(["calibrate", str(log), "--method", "serial"])
+    assert f"Configuration: {file}" in capsys.readouterr().err
+
+
+def test_parameters_by_which_an_autopilot_corrected_are_shown(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    log = tmp_path / "v" / "s" / "f.ulg"
+    log.parent.mkdir(parents=True)
+    known = {"CAL_GYRO0_ID": GYRO_ID, "CAL_GYRO0_XOFF": 0.125, "CAL_GYRO0_YOFF": 0.0}
+    log.write_bytes(b"".join(parts_of(ulog_flight(), parameters=known)))
+    told = shown(capsys, "inspect", str(log))
+    assert f"applied   gyroscope {GYRO_ID}: CAL_GYRO0_XOFF 0.125\n" in told
 
 
 def test_init_writes_what_passes_the_check_and_changes_nothing(

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from fieldcal.cli.present.flight import fit_table, print_refusals
+from fieldcal.cli.present.flight import fit_table, print_refusals, residual_table
 from fieldcal.stages.pipeline import PIPELINE
 from fieldcal.stages.stage import run_stage
 from fieldcal.words.flights import advised, is_consequence
@@ -73,3 +73,14 @@ def test_advice_is_given_where_a_stage_went_well_but_weakly() -> None:
     strong = {"stage": "joint", "status": "ok", "measured": {"advice": ""}}
     refused = {"stage": "joint", "status": "refused", "measured": {"advice": "Add 60° of yaw."}}
     assert advised([weak, strong, refused, {"stage": "verify", "status": "ok", "measured": {}}]) == ["Add 60° of roll."]
+
+
+def test_residual_rows_without_scale_or_zero_make_no_table() -> None:
+    """A flight at rest that tells the warm-up alone."""
+    row = {"flight_id": "f", "unit_id": "u", "sensor": "accelerometer", "method": "attitude", "axis": "x"}
+    found = row | {"status": "ok", "reason_code": None, "value": 1.0, "sd": 0.1, "unit": "1"}
+    rows: Any = [found | {"parameter": parameter} for parameter in ("residual_zero_per_degc", "zero_per_degc")]
+    assert residual_table(rows) is None
+    listed = residual_table([found | {"parameter": "residual_scale"}])  # type: ignore[list-item]
+    assert listed is not None
+    assert len(listed.rows) == 1

@@ -76,6 +76,18 @@ def test_a_channel_that_stands_for_a_while(seconds: float, fatal: bool) -> None:
     assert fault.value == pytest.approx(seconds / T[-1], rel=0.02)
 
 
+def test_a_value_before_and_after_a_pause_of_the_log_was_not_held_meanwhile() -> None:
+    """A coarse channel comes back from a pause with the value of before often enough; a stuck one stands on both sides
+    of it."""
+    t = np.where(np.arange(len(T)) < 8000, T, T + 80.0)
+    x = moving(counts=True)
+    x[8000, 0] = x[7999, 0]
+    assert channel_faults("magnetometer", t, x, "counts", None) == []
+    x[7600:8400, 0] = x[7600, 0]
+    (fault,) = channel_faults("magnetometer", t, x, "counts", None)
+    assert fault.value == pytest.approx(4.0 / t[-1], rel=0.02)
+
+
 @pytest.mark.parametrize("counts", [False, True])
 def test_a_clipped_channel_counts_its_samples(counts: bool) -> None:
     x = moving(counts=counts)

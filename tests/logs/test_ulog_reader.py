@@ -381,6 +381,14 @@ def test_a_simulation_is_quarantined_unless_the_vehicle_is_one(tmp_path: Path, m
         assert "simulated" in [finding["code"] for finding in facts["findings"]]
 
 
+def test_a_simulation_of_a_moment_is_told_as_one(tmp_path: Path) -> None:
+    read_topics(tmp_path, flight(0.02), infos={"ver_hw": "PX4_SITL"})
+    _, facts = ingest.read_flight(tmp_path / "f.ulg", parse("", None).vehicle("v"))
+    assert facts["reason_code"] == "too_few_samples"
+    assert facts["reason"] is not None
+    assert "is of a simulation" in facts["reason"]
+
+
 def test_calibrate_takes_a_simulation(tmp_path: Path) -> None:
     folder = tmp_path / "v" / "s"
     folder.mkdir(parents=True)

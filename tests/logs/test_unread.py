@@ -42,6 +42,7 @@ def archive(tmp_path: Path) -> Path:
 def test_each_is_told_with_its_reason(archive: Path) -> None:
     assert unread(archive) == [
         ("a/loose.bag", MISPLACED),
+        ("a/plan.pdf", UNKNOWN),
         ("a/s1/NGIMU", UNKNOWN_FOLDER),
         ("a/s1/film.mp4", UNKNOWN),
         ("a/s1/notes.txt", UNKNOWN),
@@ -56,8 +57,18 @@ def test_each_is_told_with_its_reason(archive: Path) -> None:
 def test_logs_of_an_archive_of_another_shape_are_not_told(archive: Path) -> None:
     given = [LogsMap(glob="*.mcap"), LogsMap(glob="**/NGIMU/*.csv"), LogsMap(glob="**/loose.bag")]
     assert [path for path, _ in unread(archive, *given)] == [
-        "a/s1/film.mp4", "a/s1/notes.txt", "a/s1/out.bin", "a/s1/table.tsv",
+        "a/plan.pdf", "a/s1/film.mp4", "a/s1/notes.txt", "a/s1/out.bin", "a/s1/table.tsv",
     ]  # fmt: skip
+
+
+def test_folders_that_hold_logs_are_looked_through_however_deep(tmp_path: Path) -> None:
+    for name in ("a/s/2026/raw/one.bin", "a/s/2026/raw/two.tlog", "a/s/2026/raw/three.ulg", "a/s/2026/film/x/y.mp4"):
+        touch(tmp_path / name)
+    assert unread(tmp_path, LogsMap(glob="a/s/*/raw/*.bin")) == [
+        ("a/s/2026/film", UNKNOWN_FOLDER),
+        ("a/s/2026/raw/three.ulg", MISPLACED),
+        ("a/s/2026/raw/two.tlog", UNKNOWN),
+    ]
 
 
 def test_tables_of_other_names_are_logs_where_a_glob_with_their_end_names_them(archive: Path) -> None:

@@ -13,17 +13,21 @@ import pytest
 from numerics_support import constants, logged, rms
 from scipy.spatial.transform import Rotation
 
+from fieldcal.config.stage_settings import ManoeuvreSettings, taken_from
 from fieldcal.geometry.rotation import from_euler
-from fieldcal.names import SENSORS
+from fieldcal.names import SENSORS, Sensor
 from fieldcal.simulation.archive import settings, signals
 from fieldcal.simulation.experiment import NOISE_VARIANCE, Experiment, SimulatedFlight, simulate
 from fieldcal.stages.pipeline import run_flight
+from fieldcal.stages.preparation import find_manoeuvre
 from fieldcal.stages.results import StageResult
-from fieldcal.stages.tables import AXES
+from fieldcal.stages.tables import AXES, columns_of, triad
 
 WRONG = 0.05  # no accepted scale may be further off
 GOOD = {"magnetometer": 0.02, "accelerometer": 0.02, "gyroscope": 0.03}
 STAGE = {"magnetometer": "magnetometer", "accelerometer": "accelerometer_pass2", "gyroscope": "gyro_output"}
+
+GYRO = triad("gyroscope")
 
 Results = dict[str, StageResult]
 
@@ -110,6 +114,21 @@ def test_small_angles_are_refused_with_the_condition_number() -> None:
         assert results[STAGE[sensor]].status == "refused"
         assert not relative_errors(results, sensor)
     assert not relative_errors(results, "gyroscope")
+
+
+def test_what_only_shakes_lies_still() -> None:
+    """Half of a minute at rest on something that hums: loud beside the other half, and no motion that tells a scale."""
+    t = np.arange(15_000) / 250.0
+    hum = np.where(t < 30.0, 2e-3 * np.sin(2.0 * np.pi * 3.0 * t), 0.0)
+    noise = np.random.default_rng(0).normal(0.0, 2e-4, (len(t), 3))
+    one = {Sensor.GYROSCOPE: (1.0, 1.0, 1.0)}
+    chosen = settings(flight().experiment, nominal_scale=dict.fromkeys(SENSORS) | one)
+    for size, expected in ((1.0, "refused"), (200.0, "ok")):
+        imu = pl.DataFrame({"t_ns": np.rint(t * 1e9).astype(np.int64)} | columns_of(size * hum[:, None] + noise, GYRO))
+        found = find_manoeuvre({"imu": imu}, taken_from(chosen, ManoeuvreSettings))
+        assert found.measured["excited_s"] == pytest.approx(30.0, abs=1.0)
+        assert found.status == expected
+    assert found.reason_code is None
 
 
 # time ----------------------------------------------------------------------------------------------------------------

@@ -34,7 +34,8 @@ def print_flight(console: Console, document: FlightDocument, nominal: Nominal = 
             console.print(f"  {finding['sentence']}", markup=False)
     rows = document["calibration"]
     if rows:
-        console.print(parameter_table(rows, nominal, wide=wide))
+        if (constants := parameter_table(rows, nominal, wide=wide)).rows:
+            console.print(constants)
         for code, names in _refused(rows).items():
             console.print(f"refused: {', '.join(names)} ({code})", markup=False)
         if (logged := residual_table(rows, wide=wide)) is not None:
@@ -87,7 +88,8 @@ def residual_table(rows: Sequence[CalibrationRow], *, wide: bool = False) -> Lis
     """Constants of the readings as logged, where the published ones are the raw sensor's."""
     own = [row for row in rows if row["parameter"].startswith(RESIDUAL)]
     bare: list[CalibrationRow] = [{**row, "parameter": row["parameter"].removeprefix(RESIDUAL)} for row in own]
-    return parameter_table(bare, wide=wide) if own else None
+    listed = parameter_table(bare, wide=wide)
+    return listed if listed.rows else None
 
 
 def beside_table(rows: Sequence[CalibrationRow]) -> Listing | None:

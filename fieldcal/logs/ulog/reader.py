@@ -103,9 +103,9 @@ class UlogLog:
                 self.summary.count_rows(table, columns)
                 yield table, columns
         self.summary.units = logged_units(self.summary, UNITS, self._vehicle.units, self._name)
-        tell_sources(self.summary, self._name, RAWER)
         if why := self._simulation():
             tell_simulated(self.summary, self._name, why, expected=self._vehicle.simulated)
+        tell_sources(self.summary, self._name, RAWER)
         report(self._file, self.summary)
 
     def _signals(self) -> Iterator[Batch]:
