@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
@@ -84,7 +85,7 @@ def screen(found: Inspection) -> Iterator[str]:
     name = Path(found.path).name
     yield from _told("log", f"{name} ({found.log_format}, {_size(found.size_bytes)}), vehicle {found.vehicle_id}")
     if found.configuration is not None:
-        yield f"{'by':{LABEL}}{found.configuration}"  # in one piece, as it can be copied
+        yield f"{'by':{LABEL}}{_that_fits(found.configuration)}"  # in one piece, as it can be copied
     yield from _told("verdict", found.verdict + (f": {found.reason}" if found.reason else ""))
     for finding in found.findings:
         if finding["sentence"] != found.reason:
@@ -134,6 +135,11 @@ def screen(found: Inspection) -> Iterator[str]:
         yield ""
         yield vehicle_header(found.vehicle_id)
         yield from found.settings
+
+
+def _that_fits(path: str) -> str:
+    """A path; where that is too long for a line, the same from the current directory."""
+    return path if LABEL + len(path) <= WIDTH else min(path, os.path.relpath(path), key=len)
 
 
 def _applied(unit: UnitOnBoard) -> str:

@@ -188,7 +188,8 @@ def test_a_configuration_near_the_log_holds_and_is_named(
         if holder == places[place]:
             break
     file = places[place] / CONFIG_NAME
-    assert f"by        {file}" in shown(capsys, "inspect", str(log))
+    told = shown(capsys, "inspect", str(log)).splitlines()
+    assert {f"by        {file}", f"by        {os.path.relpath(file)}"} & set(told)
     found = document(capsys, log)
     assert found["configuration"] == str(file)
     assert {"key": "world", "value": "enu", "value_from": "configuration"} in found["conventions"]

@@ -71,6 +71,9 @@ def test_types_go_before_hints_and_hints_before_the_alphabet() -> None:
     assert [(f.code, f.count) for f in summary.findings] == [("ambiguous_topic", 2)]
     found, _ = chosen(IMU | {"/a": "nav_msgs/msg/Odometry", "/z/Vicon": "nav_msgs/msg/Odometry"})
     assert found["vps"].topic == "/z/Vicon"
+    pose = "geometry_msgs/msg/PoseStamped"
+    found, _ = chosen(IMU | {"/mavros/local_position/pose": pose, "/z": pose})
+    assert found["vps"].topic == "/z"  # the other is the vehicle's own estimate
     found, summary = chosen(IMU | {"/a": "nav_msgs/msg/Odometry"})
     assert (found["vps"].topic, summary.findings) == ("/a", [])
 
