@@ -1536,12 +1536,6 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "1.0 → 1.1",
     ): "counts are whole",
     (
-        "logs.dataflash.units",
-        "magnetometers",
-        "key=lambda stream: not parameters.value(compass_names(stream.instance).use, 0, 1.0),",
-        "1.0 → 1.1",
-    ): _SWITCH,
-    (
         "estimation.joint.kernel",
         "residuals",
         "laid = _laid_rows(model, state, path, {}, 0)",
