@@ -8,11 +8,9 @@ import polars as pl
 
 from fieldcal.names import Status
 from fieldcal.schemas.columns import FLOWN_ORDER
-from fieldcal.trends.one_sensor import RECOGNISED, Exchange, of_present_sensor
+from fieldcal.trends.one_sensor import RECOGNISED, Exchanges, of_present_sensor
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.decisions.withdrawn import counting
-
-Exchanges = dict[tuple[str, str], Exchange]
 
 
 def information_that_counts(root: Path) -> tuple[pl.DataFrame, Exchanges]:
