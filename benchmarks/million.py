@@ -254,9 +254,9 @@ def latest_of_one(root: Path) -> None:
 
 
 def drift(root: Path) -> None:
-    from fieldcal.trends.drift_table import update_drift
+    from fieldcal.trends.drift_table import publish_drift
 
-    update_drift(root)
+    publish_drift(root)
 
 
 def pooled(root: Path) -> None:

@@ -59,14 +59,19 @@ def update_drift(root: Path) -> tuple[str, ...]:
     for _ in range(ATTEMPTS):
         before = _state(root)
         changed |= set(update_pooled(root))
-        memory = Memory(root, run_key("evidence", source_digest(evidence), {}, {}))
-        flights = history_in_groups(root, remember=True)
-        table = table_of(flights, bends_of(root), memory, Warehouse(root).scan("pooled").collect())
-        memory.save()
-        changed |= publish_where_other(root, "drift", table)
+        changed |= publish_drift(root)
         if _state(root) == before:
             break
     return tuple(sorted(changed))
+
+
+def publish_drift(root: Path) -> set[str]:
+    """The same of the table `drift` alone, with the table `pooled` as it lies there."""
+    memory = Memory(root, run_key("evidence", source_digest(evidence), {}, {}))
+    pooled = Warehouse(root).scan("pooled").drop(verdicts.BY_FLIGHT).collect()
+    table = table_of(history_in_groups(root, remember=True), bends_of(root), memory, pooled)
+    memory.save()
+    return publish_where_other(root, "drift", table)
 
 
 def drift_table(root: Path, memory: Memory | None = None, pooled: pl.DataFrame | None = None) -> pl.DataFrame:

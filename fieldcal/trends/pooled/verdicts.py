@@ -84,7 +84,7 @@ def read(
 
     `readings`: of the flights that they are of. A scale or zero that no flight tells alone has a row too."""
     known: dict[tuple[str, ...], dict[str, PooledRow]] = {}
-    for own in typed(pooled.drop(*BY_FLIGHT).iter_rows(named=True), PooledRow):
+    for own in typed(pooled.drop(BY_FLIGHT, strict=False).iter_rows(named=True), PooledRow):
         known.setdefault((own["unit_id"], own["sensor"], own["axis"]), {})[own["parameter"]] = own
     rows, trends, borrowed = _with_unseen(rows, trends, borrowed, known)
     columns = {name: getattr(trends, name).copy() for name in COLUMNS}
