@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 import polars as pl
 
+from fieldcal.estimation.segments import run_starts
 from fieldcal.names import GRAVEST_FIRST
 from fieldcal.provenance.run_key import run_key, source_digest
 from fieldcal.schemas import FLIGHT_TABLES, TABLES
@@ -88,10 +89,9 @@ def table_of(
 ) -> pl.DataFrame:
     """The table `drift` of `history_in_groups`' rows, of `bends_of`'s curves and of the table `pooled`."""
     pooled = empty_frame("pooled") if pooled is None else pooled
-    several = [reduced(own, bends) for own in flights if not own.is_empty()]
-    if not several:
+    fleet = together(reduced(own, bends) for own in flights if not own.is_empty())
+    if fleet is None:
         return empty_frame("drift")
-    fleet = together(several)
     known = verdicts.read(fleet.readings, *trends_of(fleet, memory or Memory()), pooled)
     rows, trends = known.rows, known.trends
     group, kind, value, sd = _siblings(rows, trends)
@@ -156,10 +156,7 @@ def trends_of(fleet: Reduced, memory: Memory) -> tuple[pl.DataFrame, regression.
 
 def _last(h: Histories, kept: np.ndarray) -> np.ndarray:
     """Day (g,) of the last flight that counts: one set aside is not what the line is as of. NaN where none does."""
-    counting = np.flatnonzero(kept)
-    day = np.full(int(h.row[-1]) + 1, np.nan)
-    day[h.row[counting]] = h.time_day[counting]  # in order of time: the last one stays
-    return day
+    return np.asarray(np.fmax.reduceat(np.where(kept, h.time_day, np.nan), run_starts(h.row)))
 
 
 def _with_curves(rows: pl.DataFrame, curves: Bent | None) -> pl.DataFrame:

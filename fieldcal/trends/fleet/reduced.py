@@ -63,8 +63,10 @@ def reduced(flights: pl.DataFrame, bends: Bends) -> Reduced:
     return Reduced(rows.drop("row"), histories, warm, readings(flights), doubts, exchanged)
 
 
-def together(several: Iterable[Reduced]) -> Reduced:
-    """All units of several, of which each has units of its own, in the order of their ids."""
+def together(several: Iterable[Reduced]) -> Reduced | None:
+    """All units of several, of which each has units of its own, in the order of their ids; None of nothing.
+
+    Of a generator's no other reference may be held: what is joined is let go of, column by column."""
     rows: list[pl.DataFrame] = []
     sizes: list[np.ndarray] = []
     held: list[dict[str, np.ndarray]] = []
@@ -80,12 +82,16 @@ def together(several: Iterable[Reduced]) -> Reduced:
         found.update(one.readings)
         doubts.update(one.doubts)
         exchanged.update(one.exchanged)
+        del one
+    if not rows:
+        return None
     units = sorted((unit, k, first, end) for k, own in enumerate(rows) for unit, first, end in _units(own))
     starts = [np.append(0, np.cumsum(own)) for own in sizes]
     columns: dict[str, np.ndarray] = {}
-    for name in BY_FLIGHT:  # one after the other, so that no two copies of everything are there at once
+    for name in BY_FLIGHT:
         parts = [own.pop(name) for own in held]
         columns[name] = np.concatenate([parts[k][starts[k][first] : starts[k][end]] for _, k, first, end in units])
+        del parts
     size = np.concatenate([sizes[k][first:end] for _, k, first, end in units])
     row = np.repeat(np.arange(len(size), dtype=np.int32), size)
     ordered = pl.concat([rows[k][first:end] for _, k, first, end in units])
