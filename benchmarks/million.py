@@ -141,8 +141,8 @@ def _equations(
     of_one: pl.DataFrame, off: np.ndarray, error: np.ndarray, rng: np.random.Generator
 ) -> tuple[pl.Series, pl.Series]:
     """(right sides, rows of information) of k flights, which agree as far as they claim to, as those of real units
-    mostly do. `off` (k, n): of the constants, in their sd; `error` (k, n): white, of what each flight says
-    of them."""
+    mostly do. `off` (k, n): of the constants, in their sd; `error` (k, n): white, of what each flight says of
+    them."""
     triangle, n = np.concatenate(of_one["information"].to_list()), of_one.height
     lower = np.zeros((n, n))
     lower[np.tril_indices(n)] = triangle
@@ -154,9 +154,8 @@ def _equations(
     row, column = np.tril_indices(n)
     several = triangle * size[:, row] * size[:, column]
     lists = pl.DataFrame({"row": np.add.outer(n * np.arange(len(off)), row).ravel(), "information": several.ravel()})
-    return pl.Series("right_side", right.ravel()), lists.group_by("row", maintain_order=True).agg("information")[
-        "information"
-    ]
+    rows = lists.group_by("row", maintain_order=True).agg("information")
+    return pl.Series("right_side", right.ravel()), rows["information"]
 
 
 def _texts(of_one: list[str | None], k: int, rng: np.random.Generator) -> list[str | None]:

@@ -64,9 +64,10 @@ def reduced(flights: pl.DataFrame, bends: Bends) -> Reduced:
 
 
 def together(several: Iterable[Reduced]) -> Reduced | None:
-    """All units of several, of which each has units of its own, in the order of their ids; None of nothing.
+    """All units of several, in the order of their ids; None of nothing. Each has units of its own: of one that somebody
+    published meanwhile, and that two have, the later counts until all is read again.
 
-    Of a generator's no other reference may be held: what is joined is let go of, column by column."""
+    Of `several` no other reference may be held: what is joined is let go of, column by column."""
     rows: list[pl.DataFrame] = []
     sizes: list[np.ndarray] = []
     held: list[dict[str, np.ndarray]] = []
@@ -85,16 +86,17 @@ def together(several: Iterable[Reduced]) -> Reduced | None:
         del one
     if not rows:
         return None
-    units = sorted((unit, k, first, end) for k, own in enumerate(rows) for unit, first, end in _units(own))
+    places = {unit: (k, first, end) for k, own in enumerate(rows) for unit, first, end in _units(own)}
+    units = [places[unit] for unit in sorted(places)]
     starts = [np.append(0, np.cumsum(own)) for own in sizes]
     columns: dict[str, np.ndarray] = {}
     for name in BY_FLIGHT:
         parts = [own.pop(name) for own in held]
-        columns[name] = np.concatenate([parts[k][starts[k][first] : starts[k][end]] for _, k, first, end in units])
+        columns[name] = np.concatenate([parts[k][starts[k][first] : starts[k][end]] for k, first, end in units])
         del parts
-    size = np.concatenate([sizes[k][first:end] for _, k, first, end in units])
+    size = np.concatenate([sizes[k][first:end] for k, first, end in units])
     row = np.repeat(np.arange(len(size), dtype=np.int32), size)
-    ordered = pl.concat([rows[k][first:end] for _, k, first, end in units])
+    ordered = pl.concat([rows[k][first:end] for k, first, end in units])
     return Reduced(ordered, Histories(row, **columns), warm, found, doubts, exchanged)
 
 
