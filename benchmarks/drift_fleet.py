@@ -288,7 +288,7 @@ def as_rows(seeds: int, first: int, understated: float, *, pooled: bool = False)
         if pooled:
             flights, information = with_information(flights)
         begun = time.process_time()
-        table = table_of(flights, pooled=pooled_of(information))
+        table = table_of([flights], pooled=pooled_of(information))
         seconds += time.process_time() - begun
         found.append(judged(table, fleet))
     error = np.array([f["error / sd of slopes, rms"] for f in found])
@@ -324,7 +324,7 @@ def late_by(seed: int, first: int, last: int) -> list[int]:
     flights = rows_of_history(draw(seed), seed)
     said: dict[int, int] = {}
     for n in range(first, last + 1):
-        table = table_of(flights.filter(pl.col("session_id") < f"s{n:02d}"))
+        table = table_of([flights.filter(pl.col("session_id") < f"s{n:02d}")])
         unit = f"unit-{DRIFTING_UNIT:02d}"
         place = {"sensor": "gyroscope", "parameter": "zero_bias", "method": "output_error", "axis": "y"}
         row = table.row(by_predicate=pl.all_horizontal(pl.col("unit_id") == unit, *_same(place)), named=True)

@@ -92,10 +92,10 @@ def grow_vehicle(root: Path, rows: Template, number: int) -> None:
         }
     ).with_columns(pl.from_epoch((pl.col("started_at") * 1e6).cast(pl.Int64), "us").dt.replace_time_zone("UTC"))
     keys = {key: [rng.bytes(16).hex() for _ in flight] for key in rows["run"]["run_key"].drop_nulls().unique().sort()}
-    for name, of_one in rows.items():
-        if of_one.is_empty():
-            continue
-        write(root, name, vehicle, _of_vehicle(name, of_one, lead, keys, rng))
+    for place, (name, of_one) in enumerate(rows.items()):
+        if not of_one.is_empty():
+            own = np.random.default_rng([SEED, number, place])
+            write(root, name, vehicle, _of_vehicle(name, of_one, lead, keys, own))
 
 
 def _of_vehicle(
@@ -119,24 +119,13 @@ def _of_vehicle(
             columns[column] = pl.Series(column, warm)
     unit = np.tile(rng.normal(0.0, UNIT_SD, n), k)
     by_session = np.repeat(rng.normal(0.0, SESSION_SD, (k // OF_A_SESSION, n)), OF_A_SESSION, axis=0).ravel()
-    off = unit + by_session + PER_DEGC * (warm - 25.0) + rng.normal(0.0, 1.0, n * k)
+    off, error = unit + by_session + PER_DEGC * (warm - 25.0), rng.normal(0.0, 1.0, n * k)
     if name == "calibration":
         sd = every["sd"].to_numpy()
-        columns["value"] = pl.Series("value", every["value"].to_numpy() + sd * off, nan_to_null=True)
+        columns["value"] = pl.Series("value", every["value"].to_numpy() + sd * (off + error), nan_to_null=True)
         columns["sd"] = pl.Series("sd", sd * rng.uniform(0.8, 1.25, n * k), nan_to_null=True)
     elif name == "information":
-        diagonal = np.array(
-            [one[-1] if one is not None and len(one) else np.nan for one in every["information"].to_list()]
-        )
-        columns["right_side"] = pl.Series("right_side", np.sqrt(np.abs(diagonal)) * off, nan_to_null=True)
-        lists = every.select(pl.col("information").explode())["information"]
-        lengths = every["information"].list.len()
-        noisy = (lists * (1.0 + 1e-6 * rng.normal(0.0, 1.0, lists.len()))).alias("information")
-        of_row = np.repeat(np.arange(n * k), lengths.to_numpy())
-        frame = (
-            pl.DataFrame({"row": of_row, "information": noisy}).group_by("row", maintain_order=True).agg("information")
-        )
-        columns["information"] = frame["information"]
+        columns["right_side"], columns["information"] = _equations(of_one, off.reshape(k, n), error.reshape(k, n), rng)
     else:
         for column, dtype in every.schema.items():
             if dtype == pl.Float64 and column not in columns:
@@ -146,6 +135,27 @@ def _of_vehicle(
         if column in every.columns:
             columns[column] = pl.Series(column, _texts(of_one[column].to_list(), k, rng))
     return every.with_columns(**columns).select(of_one.columns)
+
+
+def _equations(
+    of_one: pl.DataFrame, off: np.ndarray, error: np.ndarray, rng: np.random.Generator
+) -> tuple[pl.Series, pl.Series]:
+    """(right sides, rows of information) of k flights, which agree as far as they claim to, as those of real units
+    mostly do. `off` (k, n): of the constants, in their sd; `error` (k, n): white, of what each flight says of
+    them."""
+    triangle, n = np.concatenate(of_one["information"].to_list()), of_one.height
+    lower = np.zeros((n, n))
+    lower[np.tril_indices(n)] = triangle
+    information = lower + np.tril(lower, -1).T
+    value, vector = np.linalg.eigh(information)
+    sd = np.sqrt(np.diagonal(np.linalg.pinv(information, rcond=1e-12, hermitian=True)))
+    right = off * sd @ information + error * np.sqrt(np.maximum(value, 0.0)) @ vector.T
+    size = 1.0 + 1e-6 * rng.normal(0.0, 1.0, off.shape)
+    row, column = np.tril_indices(n)
+    several = triangle * size[:, row] * size[:, column]
+    lists = pl.DataFrame({"row": np.add.outer(n * np.arange(len(off)), row).ravel(), "information": several.ravel()})
+    rows = lists.group_by("row", maintain_order=True).agg("information")
+    return pl.Series("right_side", right.ravel()), rows["information"]
 
 
 def _texts(of_one: list[str | None], k: int, rng: np.random.Generator) -> list[str | None]:
@@ -243,9 +253,9 @@ def latest_of_one(root: Path) -> None:
 
 
 def drift(root: Path) -> None:
-    from fieldcal.trends.drift_table import update_drift
+    from fieldcal.trends.drift_table import publish_drift
 
-    update_drift(root)
+    publish_drift(root)
 
 
 def pooled(root: Path) -> None:

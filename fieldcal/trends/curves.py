@@ -68,12 +68,12 @@ def bends_of(root: Path) -> Bends:
     return found
 
 
-def bent(flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends: Trends, bends: Bends) -> Bent | None:
+def bent(h: Histories, rows: pl.DataFrame, trends: Trends, warm: Mapping[tuple[str, str], Source]) -> Bent | None:
     """The bends of `zero` and `zero_bias`, where warm-up flights, or they and the sessions together, show one.
 
-    A unit that stepped is judged by its warm-up flights alone. None where no series is bent.
+    `warm`: as `warm_up_flights`. A unit that stepped is judged by its warm-up flights alone. None where no series is
+    bent.
     """
-    warm = _warm(flights, bends)
     if not warm:
         return None
     place = {key: i for i, key in enumerate(rows.select("unit_id", "method", "parameter", "axis").iter_rows())}
@@ -109,8 +109,9 @@ def bent(flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends: Trends
     return Bent(replace(h, value=value), slope, slope_sd, bend, bend_sd, wider)
 
 
-def _warm(flights: pl.DataFrame, bends: Bends) -> dict[tuple[str, str], Source]:
-    """(unit, axis) → its warm-up flights' cubics combined; their scatter about the mean widens its sd."""
+def warm_up_flights(flights: pl.DataFrame, bends: Bends) -> dict[tuple[str, str], Source]:
+    """Of rows of flights, (unit, axis) → its warm-up flights' cubics combined; their scatter about the mean widens the
+    sd."""
     fitted = flights.filter(sensor="gyroscope", method=METHOD, parameter=PARAMETER)
     sources: dict[tuple[str, str], list[Source]] = {}
     for unit_id, flight_id, axis in fitted.select("unit_id", "flight_id", "axis").iter_rows():

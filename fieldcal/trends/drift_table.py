@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import polars as pl
 
+from fieldcal.estimation.segments import run_starts
 from fieldcal.names import GRAVEST_FIRST
 from fieldcal.provenance.run_key import run_key, source_digest
-from fieldcal.schemas import FLIGHT_TABLES, TABLES, table_key
+from fieldcal.schemas import FLIGHT_TABLES, TABLES
 from fieldcal.schemas.reference import ENOUGH_SESSIONS
 from fieldcal.schemas.rows import DriftRow
 from fieldcal.trends import few_sessions, regression, siblings, temperatures
@@ -18,9 +21,10 @@ from fieldcal.trends.curves import Bends, Bent, bends_of, bent
 from fieldcal.trends.evidence import evidence
 from fieldcal.trends.evidence_cache import Memory
 from fieldcal.trends.fleet.publishing import publish_where_other
-from fieldcal.trends.fleet.rows import history_of_everything
+from fieldcal.trends.fleet.reduced import DAY_US, KEY, Reduced, reduced, together
+from fieldcal.trends.fleet.rows import history_in_groups
 from fieldcal.trends.more_sessions import needed
-from fieldcal.trends.one_sensor import of_present_sensor, told
+from fieldcal.trends.one_sensor import told
 from fieldcal.trends.pooled import verdicts
 from fieldcal.trends.pooled.table import pooled_table, update_pooled
 from fieldcal.trends.reasons import VPS, reason
@@ -30,15 +34,12 @@ from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.layout import history_files
 from fieldcal.warehouse.questions import existing, those_asked_for
 from fieldcal.warehouse.store import empty_frame
-from fieldcal.words.rows import typed
 
-KEY = list(table_key("drift"))
 ALIKE = ("sensor", "method", "parameter", "unit")
 SIBLINGS = (*ALIKE, "axis")
 SIGNED = ("scale", "bias", "zero_bias")
 """Parameters whose sign follows the polarity of the axis: siblings may be mounted the other way round."""
 NO_BENDS: Bends = {}
-DAY_US = 86_400_000_000
 ATTEMPTS = 10
 
 
@@ -59,35 +60,39 @@ def update_drift(root: Path) -> tuple[str, ...]:
     for _ in range(ATTEMPTS):
         before = _state(root)
         changed |= set(update_pooled(root))
-        memory = Memory(root, run_key("evidence", source_digest(evidence), {}, {}))
-        rows = history_of_everything(root, remember=True)
-        table = table_of(rows, bends_of(root), memory, Warehouse(root).scan("pooled").collect())
-        memory.save()
-        changed |= publish_where_other(root, "drift", table)
+        changed |= publish_drift(root)
         if _state(root) == before:
             break
     return tuple(sorted(changed))
 
 
+def publish_drift(root: Path) -> set[str]:
+    """The same of the table `drift` alone, with the table `pooled` as it lies there."""
+    memory = Memory(root, run_key("evidence", source_digest(evidence), {}, {}))
+    pooled = Warehouse(root).scan("pooled").drop(verdicts.BY_FLIGHT).collect()
+    table = table_of(history_in_groups(root, remember=True), bends_of(root), memory, pooled)
+    memory.save()
+    return publish_where_other(root, "drift", table)
+
+
 def drift_table(root: Path, memory: Memory | None = None, pooled: pl.DataFrame | None = None) -> pl.DataFrame:
     """The table `drift` as the history has it now; nothing is written. `pooled`: that table, else it is made."""
     pooled = pooled_table(root) if pooled is None else pooled
-    return table_of(history_of_everything(root), bends_of(root), memory, pooled)
+    return table_of(history_in_groups(root), bends_of(root), memory, pooled)
 
 
 def table_of(
-    flights: pl.DataFrame,
+    flights: Iterable[pl.DataFrame],
     bends: Bends = NO_BENDS,
     memory: Memory | None = None,
     pooled: pl.DataFrame | None = None,
 ) -> pl.DataFrame:
-    """The table `drift` of `history_of_everything`'s rows, of `bends_of`'s curves and of the table `pooled`."""
+    """The table `drift` of `history_in_groups`' rows, of `bends_of`'s curves and of the table `pooled`."""
     pooled = empty_frame("pooled") if pooled is None else pooled
-    if flights.is_empty() and pooled.is_empty():
+    fleet = together(reduced(own, bends) for own in flights if not own.is_empty())
+    if fleet is None:
         return empty_frame("drift")
-    flights, doubts = temperatures.judged(flights)
-    flights, exchanged = of_present_sensor(flights)
-    known = verdicts.read(flights, *trends_of(flights, bends, memory or Memory()), pooled)
+    known = verdicts.read(fleet.readings, *trends_of(fleet, memory or Memory()), pooled)
     rows, trends = known.rows, known.trends
     group, kind, value, sd = _siblings(rows, trends)
     stepped, drifting = regression.moving(known.judged)
@@ -119,40 +124,21 @@ def table_of(
         status=pl.Series(known.statuses(regression.statuses(known.judged, fleet_p)).tolist(), dtype=pl.String),
     )
     more = needed(trends)
-    rows_made = typed(result.iter_rows(named=True), DriftRow)
+    rows_made = cast(Iterator[DriftRow], result.iter_rows(named=True))
     reasons = [reason(row, int(n)) for row, n in zip(rows_made, more, strict=True)]
-    explained = told(result.with_columns(reason=pl.Series(known.with_words(reasons), dtype=pl.String)), exchanged)
-    explained = temperatures.with_notes(explained, doubts)
+    explained = told(result.with_columns(reason=pl.Series(known.with_words(reasons), dtype=pl.String)), fleet.exchanged)
+    explained = temperatures.with_notes(explained, fleet.doubts)
     return explained.select(TABLES["drift"].column_names).sort(KEY)
 
 
-def trends_of(
-    flights: pl.DataFrame, bends: Bends, memory: Memory
-) -> tuple[pl.DataFrame, regression.Trends, np.ndarray]:
-    """(one row a series with what is the same throughout it, its trends, how many siblings lent to it) of
-    `history_of_everything`'s rows."""
-    numbered = flights.with_columns(row=pl.struct(KEY).rle_id())
-    kept = Histories(
-        row=numbered["row"].to_numpy().astype(np.int64),
-        session=flights.select(pl.struct("vehicle_id", "session_id").rank("dense"))
-        .to_series()
-        .to_numpy()
-        .astype(np.int64),
-        time_day=flights["started_at"].dt.timestamp("us").cast(pl.Float64).to_numpy() / DAY_US,
-        temperature_degc=flights["temperature_degc"].to_numpy(),
-        value=flights["value"].to_numpy(),
-        sd=flights["sd"].to_numpy(),
-    )
-    rows = numbered.group_by("row", maintain_order=True).agg(
-        *(pl.col(name).last() for name in (*KEY, "vehicle_id", "imu_id", "unit")),
-        temperature_min_degc=pl.col("temperature_degc").min(),
-        temperature_max_degc=pl.col("temperature_degc").max(),
-    )
+def trends_of(fleet: Reduced, memory: Memory) -> tuple[pl.DataFrame, regression.Trends, np.ndarray]:
+    """(one row a series with what is the same throughout it, its trends, how many siblings lent to it)."""
+    rows, kept = fleet.rows, fleet.histories
     kept = replace(kept, kind=_labels(rows, ALIKE))
     of_unit = rows["unit_id"].rle_id().to_numpy()
     trends = regression.judge(memory.of(kept, of_unit), kept.kind)
-    curves = bent(flights, kept, rows, trends, bends)
-    if (slopes := slopes_of_warm_ups(flights, kept, rows, trends)) is not None:
+    curves = bent(kept, rows, trends, fleet.warm)
+    if (slopes := slopes_of_warm_ups(kept, rows, trends)) is not None:
         slope, slope_sd = slopes
         if curves is not None:
             is_bent = np.isfinite(curves.bend).all(axis=1)
@@ -162,13 +148,15 @@ def trends_of(
         trends = regression.judge(memory.of(with_slopes, of_unit), kept.kind)
         trends = trends if curves is None else curves.widened(trends)
     rows = _with_curves(rows, curves)
-    # A flight set aside is not what the line is as of.
-    kept_at = numbered.select("row", "started_at").filter(pl.Series(trends.kept))
-    last = kept_at.group_by("row").agg(as_of=pl.col("started_at").last())
-    rows = rows.join(last, on="row", how="left", maintain_order="left")
+    rows = rows.with_columns(as_of=_moments(_last(kept, trends.kept)))
     stepped, drifting = regression.moving(trends)
     steady = (trends.n_sessions >= ENOUGH_SESSIONS) & ~stepped & ~drifting
     return rows, *few_sessions.borrow(kept, trends, _labels(rows, SIBLINGS), _sign(rows, trends), steady)
+
+
+def _last(h: Histories, kept: np.ndarray) -> np.ndarray:
+    """Day (g,) of the last flight that counts: one set aside is not what the line is as of. NaN where none does."""
+    return np.asarray(np.fmax.reduceat(np.where(kept, h.time_day, np.nan), run_starts(h.row)))
 
 
 def _with_curves(rows: pl.DataFrame, curves: Bent | None) -> pl.DataFrame:

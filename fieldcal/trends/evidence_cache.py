@@ -75,7 +75,7 @@ def _block(h: Histories, first_row: int, end_row: int, start: int, end: int) -> 
     if known is not None and np.isnan(known).all():
         known = known_sd = None
     return Histories(
-        row=h.row[flights] - first_row,
+        row=h.row[flights].astype(np.int64) - first_row,
         session=np.unique(h.session[flights], return_inverse=True)[1],
         time_day=h.time_day[flights],
         temperature_degc=h.temperature_degc[flights],

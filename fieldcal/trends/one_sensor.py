@@ -54,12 +54,16 @@ class Exchange:
         )
 
 
-def of_present_sensor(flights: pl.DataFrame) -> tuple[pl.DataFrame, dict[tuple[str, str], Exchange]]:
+Exchanges = dict[tuple[str, str], Exchange]
+"""By unit and sensor."""
+
+
+def of_present_sensor(flights: pl.DataFrame) -> tuple[pl.DataFrame, Exchanges]:
     """(rows without those of flights with another sensor, (unit_id, sensor) → what was exchanged).
 
-    `flights`: rows of `history_of_everything`.
+    `flights`: rows of whole units, as `history_in_groups` has them.
     """
-    exchanged: dict[tuple[str, str], Exchange] = {}
+    exchanged: Exchanges = {}
     dropped = []
     for (unit_id, sensor), own in _suspects(flights).group_by("unit_id", "sensor", maintain_order=True):
         scales, sd = (own.select(f"{name}_{axis}" for axis in AXES).to_numpy() for name in ("value", "sd"))
@@ -89,7 +93,7 @@ def of_present_sensor(flights: pl.DataFrame) -> tuple[pl.DataFrame, dict[tuple[s
 
 def told(
     table: pl.DataFrame,
-    exchanged: dict[tuple[str, str], Exchange],
+    exchanged: Exchanges,
     steady: Sequence[str] = (DriftStatus.STABLE, DriftStatus.INSUFFICIENT),
 ) -> pl.DataFrame:
     """The table `drift` or `pooled` with what was exchanged: a unit of which one sensor flew after another has stepped,

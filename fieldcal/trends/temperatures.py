@@ -13,7 +13,7 @@ LEAST_SESSIONS, STUCK_DEGC = 3, 0.005
 def judged(flights: pl.DataFrame) -> tuple[pl.DataFrame, dict[str, str]]:
     """(rows whose temperature is null where it is not to be believed, unit_id → sentence on what is not).
 
-    `flights`: rows of `trends.drift_table.history_of_everything`.
+    `flights`: rows of whole units, as `history_in_groups` has them.
     """
     warm, unit = pl.col("temperature_degc"), "unit_id"
     low, high = PLAUSIBLE_DEGC

@@ -16,18 +16,17 @@ DISAGREE_SIGMAS = 3.0
 warm-up's gradients inside the IMU are then part of its slope."""
 
 
-def slopes_of_warm_ups(
-    flights: pl.DataFrame, h: Histories, rows: pl.DataFrame, trends: Trends
-) -> tuple[Array, Array] | None:
+def slopes_of_warm_ups(h: Histories, rows: pl.DataFrame, trends: Trends) -> tuple[Array, Array] | None:
     """(slope per °C, sd), each (g,), of the series `zero` and `zero_bias` from flights that warmed up; NaN elsewhere.
 
     `zero_per_degc` is pooled over flights with its scatter. It is the slope of `zero`; of `zero_bias` = −λ (zero − d0)
     it is −λ times, and the slope of the scale adds λ'/λ zero_bias, of which the usual size is in the sd. None where no
     flight warmed up.
     """
-    fitted = ((flights["method"] == METHOD) & (flights["parameter"] == PARAMETER)).to_numpy()
-    if not fitted.any():
+    told = ((rows["method"] == METHOD) & (rows["parameter"] == PARAMETER)).to_numpy()
+    if not told.any():
         return None
+    fitted = told[h.row]
     series, number = np.unique(h.row[fitted], return_inverse=True)
     mean, sd = pooled(
         Histories(

@@ -15,7 +15,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +29,7 @@ from fieldcal.batch.elsewhere.same import made_by
 from fieldcal.batch.elsewhere.work import FarAnswer, FarBatch, far, take_in, work
 from fieldcal.batch.night import plan_night
 from fieldcal.batch.steps import STEPS
+from fieldcal.cli.main import run
 from fieldcal.errors import FieldcalError
 from fieldcal.flows.cluster.answers import FarAnswers, taken_in
 from fieldcal.flows.cluster.dask import check_versions
@@ -219,6 +220,32 @@ def test_all_workers_of_a_scheduler_are_asked_first() -> None:
         check_versions(Scheduler(a=made_by(), b={**made_by(), "fieldcal": "0.0.9"}))
     with pytest.raises(FieldcalError, match=r"^Worker a does not run this fieldcal \(ModuleNotFoundError"):
         check_versions(Scheduler(a=ModuleNotFoundError("fieldcal"), b=made_by()))
+
+
+@pytest.mark.parametrize("runner", ["dask", "pool"])
+def test_the_command_says_in_one_sentence_which_worker_has_other_versions(
+    whole: Whole, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, runner: str
+) -> None:
+    """Before any batch goes to a scheduler, and by the answer of a pool's worker."""
+    older = {**made_by(), "numpy": "2.4.99"}
+
+    def pool(inputs: Sequence[Batch]) -> FarAnswers:
+        for given in inputs:
+            with machine(tmp_path / "worker"):
+                yield given, work({**far(given), "made_by": older})
+
+    monkeypatch.setattr("fieldcal.flows.cluster.dask.scheduler_client", lambda _: nullcontext(Scheduler(w1=older)))
+    monkeypatch.setattr("fieldcal.flows.nightly.far_pool_answers", pool)
+    where = ["--scheduler", "tcp://elsewhere"] if runner == "dask" else []
+    with machine(tmp_path / "night"):
+        command = ["nightly", LOGS, "--warehouse", f"s3://warehouse/older-{runner}"]
+        assert run([*command, "--runner", runner, *where]) == 1
+    *before, told = capsys.readouterr().err.splitlines()
+    assert before == [f"{N_FLIGHTS} logs, {N_FLIGHTS} of them new or changed"]
+    has = "w1 has .*numpy 2.4.99, the night .*numpy" if runner == "dask" else ".+ has .*, the night .*numpy 2.4.99"
+    assert re.search(rf"^fieldcal: Worker {has}.*: install the same on both, then run it again\.$", told)
+    with machine(tmp_path / "somebody"):
+        assert Warehouse(f"s3://warehouse/older-{runner}").scan("flight").collect().is_empty()
 
 
 def test_the_night_says_what_its_workers_log(

@@ -13,7 +13,7 @@ from history_rows import START, lead, rows
 
 from fieldcal.cli.main import run
 from fieldcal.trends import drift_table as drift_table_module
-from fieldcal.trends.drift_table import drift_table, history_of_everything, update_drift
+from fieldcal.trends.drift_table import drift_table, history_in_groups, update_drift
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.content import content_sha256
 from fieldcal.warehouse.publish import publish
@@ -135,7 +135,7 @@ def test_flights_without_a_time_or_in_another_unit_do_not_count(tmp_path: Path) 
     untimed = first.with_columns(flight_id=pl.lit("untimed"), started_at=pl.lit(None, dtype=START_TYPE))
     counts = first.with_columns(flight_id=pl.lit("counts"), unit=pl.lit("counts"))
     publish(tmp_path, "v00", {"calibration": pl.concat([untimed, counts])}, ["untimed", "counts"])
-    flights = history_of_everything(tmp_path)
+    flights = pl.concat(history_in_groups(tmp_path))
     assert set(flights["flight_id"]) == {f"v00-{k:03d}" for k in range(8)}
     assert set(drift_table(tmp_path)["unit"]) == {"rad/s", "m/s^2"}
 
@@ -249,14 +249,14 @@ def test_flights_published_meanwhile_are_in_the_trends(tmp_path: Path, monkeypat
     published = publish_fleet(tmp_path / "root", units=1, sessions=8)
     late = Warehouse(other).scan("calibration", vehicle_id="v01").collect()
     assert published["v00"].height == late.height
-    read = drift_table_module.history_of_everything
+    read = drift_table_module.history_in_groups
 
-    def and_then_another(root: Path, *, remember: bool) -> pl.DataFrame:
-        rows_read = read(root, remember=remember)
+    def and_then_another(root: Path, *, remember: bool) -> list[pl.DataFrame]:
+        rows_read = list(read(root, remember=remember))
         publish(root, "v01", {"calibration": late}, late["flight_id"].unique().to_list())
         return rows_read
 
-    monkeypatch.setattr(drift_table_module, "history_of_everything", and_then_another)
+    monkeypatch.setattr(drift_table_module, "history_in_groups", and_then_another)
     update_drift(tmp_path / "root")
     tables = [Warehouse(root).scan("drift").collect() for root in (tmp_path / "root", other)]
     assert tables[0].equals(tables[1])

@@ -11,7 +11,7 @@ import pytest
 from drift_history import TAU, publish_fleet
 from history_rows import START, rows
 
-from fieldcal.trends.drift_table import bends_of, drift_table, history_of_everything, table_of, update_drift
+from fieldcal.trends.drift_table import bends_of, drift_table, history_in_groups, table_of, update_drift
 from fieldcal.trends.evidence_cache import PLACE, Memory
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.content import content_sha256
@@ -49,7 +49,7 @@ def another_flight(root: Path) -> None:
 
 def regressed(root: Path) -> tuple[pl.DataFrame, int]:
     memory = Memory(root, "code")
-    table = table_of(history_of_everything(root), bends_of(root), memory)
+    table = table_of(history_in_groups(root), bends_of(root), memory)
     memory.save()
     return table, memory.regressed
 
@@ -102,15 +102,15 @@ def test_a_damaged_memory_is_not_used(root: Path, damage: str) -> None:
 
 
 def test_other_code_or_other_values_are_regressed(root: Path) -> None:
-    flights = history_of_everything(root)
+    flights = pl.concat(history_in_groups(root))
     memory = Memory(root, "code")
-    table_of(flights, memory=memory)
+    table_of([flights], memory=memory)
     memory.save()
     other = Memory(root, "other code")
-    table_of(flights, memory=other)
+    table_of([flights], memory=other)
     assert other.regressed == UNITS
     one = (pl.col("imu_id") == "imu-02") & (pl.col("flight_id") == "v02-003") & (pl.col("axis") == "z")
     nudged = flights.with_columns(sd=pl.when(one).then(np.nextafter(2e-4, 1.0)).otherwise("sd"))
     memory = Memory(root, "code")
-    table_of(nudged, memory=memory)
+    table_of([nudged], memory=memory)
     assert memory.regressed == 1

@@ -10,8 +10,9 @@ from history_rows import lead, rows
 from polars.testing import assert_frame_equal
 
 from fieldcal.trends.fleet import rows as fleet_rows
+from fieldcal.trends.fleet.groups import groups
 from fieldcal.trends.fleet.publishing import publish_where_other
-from fieldcal.trends.fleet.rows import ORDER, PLACE, _read, _stays, history_of_everything
+from fieldcal.trends.fleet.rows import ORDER, PLACE, _read, _stays, history_in_groups
 from fieldcal.warehouse.decisions.withdrawn import counting
 from fieldcal.warehouse.publish import publish
 
@@ -42,6 +43,10 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def everything(root: Path, *, remember: bool = True) -> pl.DataFrame:
+    return pl.concat(history_in_groups(root, remember=remember))
+
+
 def all_at_once(root: Path) -> pl.DataFrame:
     return _read(root, None, counting(root)).sort(ORDER, nulls_last=False).filter(_stays())
 
@@ -50,9 +55,17 @@ def test_rows_are_those_read_all_at_once(root: Path) -> None:
     expected = all_at_once(root)
     assert expected.height < _read(root, None, counting(root)).height  # some have another unit, or no time
     for _ in range(2):
-        assert_frame_equal(history_of_everything(root, remember=True), expected)
-    assert_frame_equal(history_of_everything(root), expected)
-    assert history_of_everything(root / "nothing").is_empty()
+        assert_frame_equal(everything(root), expected)
+    assert_frame_equal(everything(root, remember=False), expected)
+    assert list(history_in_groups(root / "nothing")) == []
+
+
+def test_vehicles_that_share_units_are_of_one_group(root: Path) -> None:
+    """c joins b to a, and a shares another with d; e and f have units of their own."""
+    fly(root, "f", ("imu-6",), 60)
+    fly(root, "e", ("imu-5",), 70)
+    assert list(groups(root, ["calibration"], 1)) == [["a", "b", "c", "d"], ["e"], ["f"]]
+    assert list(groups(root, ["calibration"])) == [["a", "b", "c", "d", "e", "f"]]
 
 
 def test_only_vehicles_that_flew_are_read_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,27 +73,27 @@ def test_only_vehicles_that_flew_are_read_again(root: Path, monkeypatch: pytest.
     own = fleet_rows._read
     monkeypatch.setattr(fleet_rows, "source_digest", lambda *functions: "code")
     monkeypatch.setattr(fleet_rows, "_read", lambda *given: (read.append(given[1]), own(*given))[1])
-    history_of_everything(root, remember=True)
+    everything(root)
     assert read == ["a", "b", "c", "d"]
-    history_of_everything(root, remember=True)
+    everything(root)
     assert len(read) == 4
     fly(root, "b", ("imu-2",), 90)
-    assert_frame_equal(history_of_everything(root, remember=True), all_at_once(root))
+    assert_frame_equal(everything(root), all_at_once(root))
     assert read[4:] == ["b"]
     place = root / PLACE / "a.bin"
     place.write_bytes(place.read_bytes()[:-3])
-    history_of_everything(root, remember=True)
+    everything(root)
     assert read[5:] == ["a"]
     monkeypatch.setattr(fleet_rows, "source_digest", lambda *functions: "other code")
-    history_of_everything(root, remember=True)
+    everything(root)
     assert read[6:] == ["a", "b", "c", "d"]
 
 
 def test_what_is_remembered_of_a_vehicle_goes_with_it(root: Path) -> None:
-    history_of_everything(root, remember=True)
+    everything(root)
     for path in root.glob("tables/*/vehicle=b/part.parquet"):
         path.unlink()
-    history_of_everything(root, remember=True)
+    everything(root)
     assert sorted(path.stem for path in (root / PLACE).iterdir()) == ["a", "c", "d"]
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import datetime as dt
 import json
 import shutil
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from polars.testing import assert_frame_equal
 from pooled import NAMES, SCATTER, START, Truth
 from pooled_support import publish_unit
 
@@ -21,7 +23,9 @@ from fieldcal.cli.main import run
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Sensor
 from fieldcal.report import write_vehicle_report
-from fieldcal.trends.drift_table import update_drift
+from fieldcal.trends.drift_table import drift_table, update_drift
+from fieldcal.trends.fleet.groups import groups
+from fieldcal.trends.pooled.table import pooled_table
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.publish import publish
 
@@ -56,6 +60,23 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Truth]]:
         publish_unit(root, vehicle, rng, truths[-1], SESSIONS, lambda session: 30, moved=partial(moved, vehicle))
     update_drift(root)
     return root, truths
+
+
+def test_a_fleet_asked_a_vehicle_at_a_time_is_the_same_fleet(
+    fleet: tuple[Path, list[Truth]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, asked = fleet[0], []
+
+    def one_by_one(root: Path, tables: Sequence[str], *_: int) -> Iterator[list[str]]:
+        for vehicles in groups(root, tables, 1):
+            asked.append(vehicles)
+            yield vehicles
+
+    monkeypatch.setattr("fieldcal.trends.fleet.rows.groups", one_by_one)
+    monkeypatch.setattr("fieldcal.trends.pooled.table.groups", one_by_one)
+    assert_frame_equal(drift_table(root), Warehouse(root).scan("drift").collect(), check_exact=True)
+    assert_frame_equal(pooled_table(root), Warehouse(root).scan("pooled").collect(), check_exact=True)
+    assert asked == 3 * [[f"v{k}"] for k in range(VEHICLES)]
 
 
 def of(rows: pl.DataFrame) -> dict[tuple[str, ...], dict[str, Any]]:

@@ -18,14 +18,12 @@ def publish_where_other(root: Path, name: str, table: pl.DataFrame) -> set[str]:
     WarehouseError
         As `fieldcal.warehouse.publish.publish`.
     """
-    own, there = (_by_vehicle(rows) for rows in (table, Warehouse(root).scan(name).collect()))
+    warehouse = Warehouse(root)
+    own = {str(vehicle_id): rows for (vehicle_id,), rows in table.partition_by("vehicle_id", as_dict=True).items()}
+    there = set(warehouse.scan(name).select("vehicle_id").unique().collect()["vehicle_id"])
     return {
         vehicle_id
-        for vehicle_id in sorted(own.keys() | there.keys())
-        if not own.get(vehicle_id, table.clear()).equals(there.get(vehicle_id, table.clear()))
+        for vehicle_id in sorted(own.keys() | there)
+        if not own.get(vehicle_id, table.clear()).equals(warehouse.scan(name, vehicle_id=vehicle_id).collect())
         and publish(root, vehicle_id, {name: own.get(vehicle_id, table.clear())}, ())
     }
-
-
-def _by_vehicle(rows: pl.DataFrame) -> dict[str, pl.DataFrame]:
-    return {str(vehicle_id): own for (vehicle_id,), own in rows.partition_by("vehicle_id", as_dict=True).items()}

@@ -20,17 +20,18 @@ from fieldcal.names import RESIDUAL, Status
 from fieldcal.provenance.run_key import source_digest
 from fieldcal.schemas import table_key
 from fieldcal.schemas.columns import FLOWN_ORDER
+from fieldcal.trends.fleet.groups import groups
 from fieldcal.trends.reasons import AGREEMENT, VPS
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.decisions.withdrawn import counting
 from fieldcal.warehouse.files import write_bytes
-from fieldcal.warehouse.layout import checksum_path, history_files, vehicle_name, vehicle_of
+from fieldcal.warehouse.layout import checksum_path, encode_id, history_files, vehicle_name
 from fieldcal.warehouse.sealed import BrokenSeal, seal_bytes, unseal_bytes
-from fieldcal.warehouse.store import read_table
 
 KEY = list(table_key("drift"))
 ORDER = [*KEY, "started_at", "vehicle_id", "sequence", "flight_id"]
-READ = ("calibration", "flight", "sync", "fit")
+OF_UNITS = ("calibration", "sync", "fit")
+READ = (*OF_UNITS, "flight")
 PLACE = Path("night") / "drift"
 
 
@@ -44,11 +45,11 @@ class Part:
     whole: bool
 
 
-def history_of_everything(root: Path, *, remember: bool = False) -> pl.DataFrame:
+def history_in_groups(root: Path, *, remember: bool = False) -> Iterator[pl.DataFrame]:
     """Values that were not refused: calibrated parameters, the VPS clock's lag and skew, Theil's coefficients.
 
-    One row a flight and series, sorted by series and time. A series keeps to the unit of its last flight, and to
-    flights with a time where any has one.
+    One row a flight and series, sorted by series and time; all flights of a unit are in one frame, of some vehicles. A
+    series keeps to the unit of its last flight, and to flights with a time where any has one.
 
     Parameters
     ----------
@@ -59,15 +60,34 @@ def history_of_everything(root: Path, *, remember: bool = False) -> pl.DataFrame
     """
     code = source_digest(_read, _part) if remember else None
     counts = counting(root)
-    blocks: dict[str, list[tuple[pl.DataFrame, bool]]] = {}
-    for part in _parts(root, code, counts):
-        start = 0
-        for unit, n in part.units.items():
-            blocks.setdefault(unit, []).append((part.rows.slice(start, n), part.whole))
-            start += n
-    if not blocks:
-        return _read(root, None, counts)
-    return pl.concat([_merged(blocks[unit]) for unit in sorted(blocks)])
+    decided = hashlib.sha256(b"".join(_recorded(root, path) for path in history_files(root, "decision")))
+    found: dict[str, list[Path]] = {}
+    for table in READ:
+        for path in history_files(root, table):
+            found.setdefault(vehicle_name(path), []).append(path)
+    if remember:
+        for other in (root / PLACE).glob("*.bin"):
+            if other.stem not in found:
+                other.unlink(missing_ok=True)
+    for vehicles in groups(root, OF_UNITS):
+        blocks: dict[str, list[tuple[pl.DataFrame, bool]]] = {}
+        for vehicle in vehicles:
+            name, key = encode_id(vehicle), hashlib.sha256(f"{code}\0{decided.hexdigest()}".encode())
+            for path in found.get(name, ()):
+                told = f"\0{path.relative_to(root)}\0".encode("utf-8", "surrogateescape")
+                key.update(told + _recorded(root, path))
+            place = root / PLACE / f"{name}.bin"
+            part = _remembered(place, key.hexdigest()) if remember else None
+            if part is None:
+                part = _part(_read(root, vehicle, counts))
+                if remember:
+                    _remember(place, key.hexdigest(), part)
+            start = 0
+            for unit, n in part.units.items():
+                blocks.setdefault(unit, []).append((part.rows.slice(start, n), part.whole))
+                start += n
+        if blocks:
+            yield pl.concat([_merged(blocks[unit]) for unit in sorted(blocks)])
 
 
 def _merged(several: list[tuple[pl.DataFrame, bool]]) -> pl.DataFrame:
@@ -83,36 +103,9 @@ def _stays() -> pl.Expr:
     return (pl.col("unit") == pl.col("unit").last().over(KEY)) & (timed | ~timed.any().over(KEY))
 
 
-def _parts(root: Path, code: str | None, counts: pl.Expr) -> Iterator[Part]:
-    decided = hashlib.sha256(b"".join(_recorded(root, path) for path in history_files(root, "decision")))
-    found: dict[str, list[Path]] = {}
-    for table in READ:
-        for path in history_files(root, table):
-            found.setdefault(vehicle_name(path), []).append(path)
-    if code is not None:
-        for other in (root / PLACE).glob("*.bin"):
-            if other.stem not in found:
-                other.unlink(missing_ok=True)
-    for name, files in found.items():
-        digest = hashlib.sha256(f"{code}\0{decided.hexdigest()}".encode())
-        for path in files:
-            digest.update(f"\0{path.relative_to(root)}\0".encode("utf-8", "surrogateescape") + _recorded(root, path))
-        part = None if code is None else _remembered(root / PLACE / f"{name}.bin", digest.hexdigest())
-        if part is None:
-            part = _part(_read(root, _vehicle(files[0]), counts))
-            if code is not None:
-                _remember(root / PLACE / f"{name}.bin", digest.hexdigest(), part)
-        yield part
-
-
 def _recorded(root: Path, path: Path) -> bytes:
     beside = checksum_path(root, path)
     return beside.read_bytes() if beside.exists() else hashlib.sha256(path.read_bytes()).digest()
-
-
-def _vehicle(path: Path) -> str:
-    vehicle_id = vehicle_of(path)
-    return str(read_table(path, path.parent.parent.name)["vehicle_id"][0]) if vehicle_id is None else vehicle_id
 
 
 def _part(rows: pl.DataFrame) -> Part:

@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import polars as pl
 
 from fieldcal.names import Status
 from fieldcal.schemas.columns import FLOWN_ORDER
-from fieldcal.trends.one_sensor import RECOGNISED, Exchange, of_present_sensor
+from fieldcal.trends.one_sensor import RECOGNISED, Exchanges, of_present_sensor
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.decisions.withdrawn import counting
 
-Exchanges = dict[tuple[str, str], Exchange]
 
-
-def information_that_counts(root: Path) -> tuple[pl.DataFrame, Exchanges]:
-    """(rows of `information` of flights that nobody withdrew, what was exchanged)."""
+def information_that_counts(root: Path, vehicles: Sequence[str] | None = None) -> tuple[pl.DataFrame, Exchanges]:
+    """(rows of `information` of flights that nobody withdrew, what was exchanged); of these vehicles, which have all
+    flights of their units (`fleet.groups`), else of all."""
     warehouse = Warehouse(root)
-    scales = warehouse.scan("calibration").filter(
+
+    def of(table: str) -> pl.LazyFrame:
+        if vehicles is None:
+            return warehouse.scan(table)
+        return pl.concat([warehouse.scan(table, vehicle_id=vehicle) for vehicle in vehicles])
+
+    scales = of("calibration").filter(
         pl.col("sensor").is_in([str(sensor) for sensor in RECOGNISED]),
         pl.col("parameter") == "scale",
         pl.col("status") == Status.OK,
     )
     order = ["unit_id", "sensor", *FLOWN_ORDER, "method", "axis"]
     known = scales.select(*order, "parameter", "value", "sd").sort(order, nulls_last=False).collect()
-    return of_present(warehouse.scan("information").filter(counting(root)).collect(), known)
+    return of_present(of("information").filter(counting(root)).collect(), known)
 
 
 def of_present(information: pl.DataFrame, scales: pl.DataFrame) -> tuple[pl.DataFrame, Exchanges]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -17,17 +17,23 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import Status
 from fieldcal.provenance.run_key import run_key, source_digest
 from fieldcal.schemas import TABLES, table_key
+from fieldcal.trends.fleet.groups import groups
 from fieldcal.trends.fleet.publishing import publish_where_other
-from fieldcal.trends.one_sensor import told
+from fieldcal.trends.one_sensor import Exchanges, told
 from fieldcal.trends.pooled.memory import Memory
 from fieldcal.trends.pooled.present import information_that_counts
 from fieldcal.trends.pooled.rows import rows_of_unit, strengths_told
-from fieldcal.trends.pooled.units import DAY, EPOCH, HistoryUnit, by_unit, first_that_tell, sessions_flown, unit_of
+from fieldcal.trends.pooled.units import DAY, EPOCH, HistoryUnit, by_unit, first_that_tell, unit_of, units_that_tell
+from fieldcal.warehouse import Warehouse
+from fieldcal.warehouse.decisions.withdrawn import counting
 from fieldcal.warehouse.store import empty_frame
 
 KEY = list(table_key("pooled"))
 MOST_UNITS = 40
 """Whose flights tell how much constants move: more hardly tell it better."""
+AT_ONCE = 100_000
+"""Rows of `information` at hand, about (`fleet.groups`)."""
+FLOWN = ("unit_id", "vehicle_id", "session_id", "flight_id", "started_at")
 FAR = 0.1
 """Relative distance of the gain at which a flight was linearised from the pooled one up to which its equations hold: a
 flight beyond it is left out and told, until its log is calibrated again."""
@@ -48,31 +54,48 @@ def update_pooled(root: Path) -> tuple[str, ...]:
 
 def pooled_table(root: Path, memory: Memory | None = None) -> pl.DataFrame:
     """The table `pooled` as the history has it now; nothing is written."""
-    information, exchanged = information_that_counts(root)
-    return told(table_of(information, memory), exchanged, (Status.OK,))
+    exchanged: Exchanges = {}
+
+    def units_of(vehicles: Sequence[str]) -> list[pl.DataFrame]:
+        information, found = information_that_counts(root, vehicles)
+        exchanged.update(found)
+        return by_unit(information)
+
+    flown = Warehouse(root).scan("information").filter(counting(root)).select(FLOWN).unique().collect()
+    telling = units_that_tell(flown, MOST_UNITS)
+    where = set(flown.filter(pl.col("unit_id").is_in(telling))["vehicle_id"])
+    several = list(groups(root, ("information",), AT_ONCE))
+    known = {_id(unit): unit for group in several if where & set(group) for unit in units_of(group)}
+    units = (unit for group in several for unit in units_of(group))
+    return told(_table([known[unit_id] for unit_id in telling], units, memory), exchanged, (Status.OK,))
 
 
 def table_of(information: pl.DataFrame, memory: Memory | None = None) -> pl.DataFrame:
     """The table `pooled` of the fleet whose rows of `information` these are."""
-    memory, units = memory or Memory(), by_unit(information)
-    if not units:
+    units = {_id(unit): unit for unit in by_unit(information)}
+    telling = units_that_tell(information, MOST_UNITS)
+    return _table([units[unit_id] for unit_id in telling], units.values(), memory)
+
+
+def _table(telling: Sequence[pl.DataFrame], units: Iterable[pl.DataFrame], memory: Memory | None) -> pl.DataFrame:
+    if not telling:
         return empty_frame("pooled")
-    # By powers of two, so that the next flight of one does not make others tell.
-    telling = [
-        first_that_tell(unit)
-        for unit in sorted(units, key=lambda unit: -sessions_flown(unit).bit_length())[:MOST_UNITS]
-    ]
+    memory, first = memory or Memory(), [first_that_tell(unit) for unit in telling]
     with one_thread():
-        kinds = memory.kinds(telling, lambda: kinds_of(telling))
-        rows = [memory.rows(unit, kinds, partial(rows_of, unit, kinds)) for unit in units]
+        kinds = memory.kinds(first, lambda: kinds_of(first))
+        rows = {_id(unit): memory.rows(unit, kinds, partial(rows_of, unit, kinds)) for unit in units}
     # A magnetometer that flew with two IMUs is what its last flight's says.
     return (
-        pl.concat(rows)
+        pl.concat([rows[unit_id] for unit_id in sorted(rows)])
         .sort("started_at", "flight_id", nulls_last=False)
         .unique(KEY, keep="last")
         .sort(KEY)
         .select(TABLES["pooled"].column_names)
     )
+
+
+def _id(unit: pl.DataFrame) -> str:
+    return str(unit["unit_id"][0])
 
 
 def table_then(root: Path, table: pl.DataFrame, moment: datetime) -> pl.DataFrame:

@@ -47,14 +47,28 @@ class HistoryUnit:
 def by_unit(rows: pl.DataFrame) -> list[pl.DataFrame]:
     """`information`'s rows of each unit with flights enough, in the order of their ids; flights in the order of time,
     only those whose time is known where there are any."""
-    ordered = rows.sort("unit_id", *FLOWN_ORDER, "place", nulls_last=False)
-    units = []
-    for own in ordered.partition_by("unit_id", maintain_order=True):
-        dated = own.filter(pl.col("started_at").is_not_null())
-        flown = dated if dated.height else own
-        if flown["flight_id"].n_unique() >= FEWEST_FLIGHTS:
-            units.append(flown)
-    return units
+    ordered = rows.sort("unit_id", *FLOWN_ORDER, "place", nulls_last=False).filter(_counts_in_time())
+    units = ordered.partition_by("unit_id", maintain_order=True)
+    return [own for own in units if own["flight_id"].n_unique() >= FEWEST_FLIGHTS]
+
+
+def units_that_tell(rows: pl.DataFrame, most: int) -> list[str]:
+    """Units that flew in most sessions, of those of `by_unit`, at most so many. By powers of two, so that the next
+    flight of one does not make others tell. `rows`: of `information`, any one of each flight."""
+    flown = (
+        rows.filter(_counts_in_time())
+        .group_by("unit_id")
+        .agg(flights=pl.col("flight_id").n_unique(), sessions=pl.struct("vehicle_id", "session_id").n_unique())
+        .filter(pl.col("flights") >= FEWEST_FLIGHTS)
+        .sort("unit_id")
+    )
+    several = flown.select("unit_id", "sessions").rows()
+    return [unit for unit, _ in sorted(several, key=lambda one: -one[1].bit_length())[:most]]
+
+
+def _counts_in_time() -> pl.Expr:
+    dated = pl.col("started_at").is_not_null()
+    return dated | ~dated.any().over("unit_id")
 
 
 def sessions_flown(rows: pl.DataFrame) -> int:

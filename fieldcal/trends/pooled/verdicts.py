@@ -32,6 +32,8 @@ AXIS = ("unit_id", "sensor", "axis")
 COLUMNS = tuple(name for name in Trends.__dataclass_fields__ if name != "kept")
 OF_CHANGE = ("n_flights", "n_sessions", "last_z", "change_day", "change_size", "change_size_sd", "drift_p")
 """Columns that are the smoother's wherever it judges."""
+BY_FLIGHT = ("flights", "shares", "distances")
+"""Columns of `pooled` that have an entry a flight: nothing here asks them."""
 Columns = dict[str, float]
 Pools = Mapping[tuple[str, ...], Mapping[str, PooledRow]]
 """Rows of the table `pooled` by `AXIS` and parameter."""
@@ -71,18 +73,23 @@ class Read:
         return [" ".join(filter(None, (reason, beside))) or None for reason, beside in both]
 
 
-def read(flights: pl.DataFrame, rows: pl.DataFrame, trends: Trends, borrowed: Array, pooled: pl.DataFrame) -> Read:
+def read(
+    readings: Mapping[tuple[str, ...], float],
+    rows: pl.DataFrame,
+    trends: Trends,
+    borrowed: Array,
+    pooled: pl.DataFrame,
+) -> Read:
     """Rows and trends of `drift_table.trends_of` with what the table `pooled` knows better.
 
-    `flights`: the rows of flights that they are of. A scale or zero that no flight tells alone has a row too."""
+    `readings`: of the flights that they are of. A scale or zero that no flight tells alone has a row too."""
     known: dict[tuple[str, ...], dict[str, PooledRow]] = {}
-    for own in typed(pooled.iter_rows(named=True), PooledRow):
+    for own in typed(pooled.drop(BY_FLIGHT, strict=False).iter_rows(named=True), PooledRow):
         known.setdefault((own["unit_id"], own["sensor"], own["axis"]), {})[own["parameter"]] = own
     rows, trends, borrowed = _with_unseen(rows, trends, borrowed, known)
     columns = {name: getattr(trends, name).copy() for name in COLUMNS}
     covered, beside = np.zeros(rows.height, dtype=bool), [""] * rows.height
     verdict, borrowed = np.full(rows.height, "", dtype=object), borrowed.copy()
-    readings = _readings(flights) if known else {}
     as_of, bent = rows["as_of"].to_list(), rows["curve_per_degc2"].is_not_null().to_list()
     for k, row in enumerate(rows.iter_rows(named=True)):
         if row["method"] not in JOINT_METHODS or (told := _told(row, known, readings)) is None:
@@ -128,7 +135,7 @@ def _with_unseen(
     return pl.concat([rows, more]), replace(trends, **columns), np.r_[borrowed, np.full(len(unseen), np.nan)]
 
 
-def _readings(flights: pl.DataFrame) -> dict[tuple[str, ...], float]:
+def readings(flights: pl.DataFrame) -> dict[tuple[str, ...], float]:
     """By `AXIS`, method and parameter of `OF_BOTH`: the reading at which scale · (reading − zero) is it, by flights'
     joint estimates alone."""
     at = [*AXIS, "method", "vehicle_id", "flight_id"]
