@@ -105,7 +105,7 @@ class VelocityFit:
             # A stretch without an epoch takes the offset of its neighbour: its heading is anyone's guess.
             which = np.flatnonzero(inside) if inside.any() else np.array([int(np.argmin(np.abs(at - first)))])
             times, turned = at[which], continuous(offset[which])
-            carried = slerp(times, turned, np.clip(readings.t[here], *times[[0, -1]])) if len(times) > 1 else turned
+            carried = slerp(times, turned, readings.t[here]) if len(times) > 1 else turned
             out[here] = multiply(carried, relative[here])
         return out
 
@@ -186,7 +186,7 @@ class _Fit:
         self.knots = place_knots(readings, epochs)
         gravity = np.array([0.0, 0.0, abs(readings.gravity_mps2)])
         values = {name: np.concatenate(start[name]) for name in TRIADS if name in start}
-        with_field = "magnetometer" in start and _between(readings, self.knots.offset) >= FEWEST_FIELDS
+        with_field = "magnetometer" in start and readings_between(readings, self.knots.offset) >= FEWEST_FIELDS
         if with_field:
             values["magnetometer"], _ = of_other_form(values["magnetometer"])
             values |= {"field": np.zeros(2), "delay": np.zeros(1)}
@@ -279,8 +279,8 @@ class _Fit:
         )
 
 
-def _between(readings: Readings, at: Array) -> int:
-    """How many readings of the magnetometer lie between the first knot and the last."""
+def readings_between(readings: Readings, at: Array) -> int:
+    """How many readings of the magnetometer lie between the first knot and the last, `at` (K,) s, at any lag."""
     if readings.magnetometer is None:
         return 0
     given = np.isfinite(readings.magnetometer).all(axis=1)

@@ -113,9 +113,13 @@ def test_outliers_change_nothing_much() -> None:
     flight = short_flight("lively", 7)
     wrong = flight.gnss_velocity.copy()
     wrong[::25] += 8.0
-    clean, spoilt = (errors(f, fitted(f)) for f in (flight, replace(flight, gnss_velocity=wrong)))
+    of_spoilt = fitted(replace(flight, gnss_velocity=wrong))
+    clean, spoilt = errors(flight, fitted(flight)), errors(flight, of_spoilt)
     for name, (error, sd) in clean.items():
         assert np.all(np.abs(spoilt[name][0] - error) < sd), name
+    outlier = of_spoilt.weight < 0.1
+    np.testing.assert_allclose(of_spoilt.residual[outlier], 8.0, atol=1.5)
+    np.testing.assert_array_equal(of_spoilt.t[outlier], np.intersect1d(flight.gnss_t[::25], of_spoilt.t))
 
 
 def test_what_clipped_residuals_do_not_tell_is_in_every_sd(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,6 +178,14 @@ def test_information_is_the_estimate_less_what_was_known() -> None:
         expected[at] = np.sqrt(np.diagonal(_of_gains(scale, bias, covariance)))
     # With the prior put back, in gains and zeros, it is the estimate again.
     assert np.allclose(np.sqrt(np.diagonal(np.linalg.inv(total))), expected, rtol=0.05)
+    # And there the record pulls as far away from the prior as the prior pulls back.
+    pull = found.right.copy()
+    for name, prior in known.items():
+        at = [k for k, parameter in enumerate(found.names) if parameter[0] == name]
+        information = np.linalg.inv(_of_gains(prior.scale, prior.bias, prior.covariance))
+        gain_and_zero = np.r_[1.0 / prior.scale, -prior.bias / prior.scale]
+        pull[at] += information @ (gain_and_zero - found.reference[at])
+    assert np.all(np.abs(np.linalg.solve(total, pull)) < 0.1 * expected)
 
 
 def test_a_short_record_is_refused() -> None:
