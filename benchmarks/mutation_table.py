@@ -53,6 +53,7 @@ TESTS: dict[str, Sequence[str]] = {
     "estimation.joint.kernel": ("compiled/test_joint_kernel.py",),
     "estimation.motion_selection": ("estimation/test_motion_selection*.py",),
     "estimation.motor_field": ("estimation/test_motor_field*.py",),
+    "estimation.normal_equations": ("estimation/test_normal_equations*.py",),
     "estimation.pooled": ("estimation/pooled/test_*.py",),
     "estimation.quadric": ("estimation/test_quadric*.py",),
     "estimation.robust": ("estimation/test_robust*.py",),

@@ -139,10 +139,10 @@ def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_
         at = np.isfinite(z)
         started_anew = known.sum() - at.sum()
         likelihood = np.sum(np.log(variance[at] / own) + z[at] ** 2) + started_anew * RESTART_SD**2
-        few = _unlikely(strengths.scatter / own)
+        few = unlikely(strengths.scatter / own)
         few += FEW * np.log1p(strengths.walk * gap_day / strengths.scatter)
         if with_slope:
-            few += _unlikely(strengths.slope / units[2])
+            few += unlikely(strengths.slope / units[2])
             few += 0.5 * FEW * np.log1p(strengths.slope * range_degc**2 / strengths.scatter)
             variance = strengths.slope * within[:, 0] ** 2 + within[:, 2]
             few += np.sum(np.minimum(np.log(variance / own) + within[:, 1] ** 2 / variance, RESTART_SD**2))
@@ -153,7 +153,7 @@ def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_
     start = min((np.log(np.square(at[:size])) for at in _starts(with_slope)), key=cost)
     simplex = start + np.eye(size + 1, size, -1)
     best = minimize(cost, start, method="Nelder-Mead", options={**TOLERANCES, "initial_simplex": simplex})
-    most = [_largest_likely(cost, best.x, best.fun, i) for i in range(size)]
+    most = [largest_likely(cost, best.x, best.fun, i) for i in range(size)]
     found = given(np.array(most))
     return replace(found, freedom=FEW + float(np.isfinite(innovations(series, found)[0]).sum()))
 
@@ -170,14 +170,14 @@ def _on_grid(value: float) -> float:
     return float(GRID ** np.round(np.log(value) / np.log(GRID))) if value > 0.0 else 0.0
 
 
-def _unlikely(ratio: float) -> float:
+def unlikely(ratio: float) -> float:
     """Minus twice the logarithm of the chance of a variance beforehand, over that of a session itself: much less than
     expected is unlikely, much more hardly, for sessions may be known ever so well."""
     above = np.log(ratio / EXPECTED_SHARE**2)
     return float(above if above > 0.0 else FEW * (above + EXPECTED_SHARE**2 / ratio - 1.0))
 
 
-def _largest_likely(cost: Callable[[Array], float], best: Array, least: float, i: int) -> float:
+def largest_likely(cost: Callable[[Array], float], best: Array, least: float, i: int) -> float:
     """The largest element i of x that is likely (`RISE`): a strength that the fleet hardly shows is
     not taken for none."""
     low, high = float(best[i]), LIMITS[1]

@@ -381,13 +381,13 @@ def jumps(past: Known, future: Known) -> tuple[Array, Array]:
 def strengths(units: Sequence[Unit], *, rounds: int = 2) -> dict[tuple[str, str], Strengths]:
     """How much each kind of constant moves, of all units: what sessions say of a constant, given what the others say
     of all others, is a series of `strengths_of`. Coarse (`Strengths.coarse`)."""
-    kinds = _first_strengths(units)
+    kinds = first_strengths(units)
     for _ in range(rounds):
         rows: dict[tuple[str, str], list[Array]] = {kind: [] for kind in kinds}
         within: dict[tuple[str, str], list[Array]] = {kind: [] for kind in kinds}
         for unit in units:
             found = pool(unit, kinds, tested=False)
-            for name, series, pairs in zip(found.names, _series(found), _within_sessions(found), strict=True):
+            for name, series, pairs in zip(found.names, series_of_sessions(found), within_sessions(found), strict=True):
                 rows[name[:2]].append(series)
                 within[name[:2]].append(pairs)
         kinds = {
@@ -401,7 +401,7 @@ def strengths(units: Sequence[Unit], *, rounds: int = 2) -> dict[tuple[str, str]
     return {kind: strengths.coarse() for kind, strengths in kinds.items()}
 
 
-def _first_strengths(units: Sequence[Unit]) -> dict[tuple[str, str], Strengths]:
+def first_strengths(units: Sequence[Unit]) -> dict[tuple[str, str], Strengths]:
     """To begin with: constants scatter as a flight alone sees them, and change by as much over a degree."""
     own: dict[tuple[str, str], list[float]] = {}
     for unit in units:
@@ -415,7 +415,7 @@ def _first_strengths(units: Sequence[Unit]) -> dict[tuple[str, str], Strengths]:
     return {name[:2]: kinds.get(name[:2], Strengths(0.0, 0.0, 0.0)) for unit in units for name in unit.names}
 
 
-def _series(found: Pooled) -> list[Array]:
+def series_of_sessions(found: Pooled) -> list[Array]:
     """Of each constant (sessions, 4): day, temperature less the reference, value there and its variance, as the session
     alone says where the other constants are what the other sessions say: what is known of the value with the session
     less what is without."""
@@ -447,7 +447,7 @@ def said_beside(before: Estimate, together: Estimate, combination: Array) -> tup
     return (x / v - (x_others * known if known else 0.0)) / information, 1.0 / information
 
 
-def _within_sessions(found: Pooled) -> list[Array]:
+def within_sessions(found: Pooled) -> list[Array]:
     """Of each constant (k, 3): how two flights of a session, one after the other, differ in temperature and value, and
     the variance of that; the other constants as the other sessions and the one flight know them."""
     pairs: list[list[tuple[float, float, float]]] = [[] for _ in found.names]

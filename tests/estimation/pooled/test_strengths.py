@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fieldcal.estimation.pooled.strengths import Series, Strengths, innovations
+from fieldcal.estimation.pooled.strengths import (
+    FEW,
+    RISE,
+    Series,
+    Strengths,
+    innovations,
+    largest_likely,
+    strengths_of,
+    unlikely,
+)
 
 
 def test_innovations_are_those_of_a_kalman_filter_with_a_walk_and_a_slope() -> None:
@@ -41,3 +50,49 @@ def test_what_is_four_and_a_half_sd_off_starts_the_series_anew(off_sd: float, an
     else:
         assert z[1, 0] == pytest.approx(off_sd)
         assert s[2, 0] == pytest.approx(1.5)
+
+
+def test_of_nothing_nothing_is_known_to_move() -> None:
+    assert strengths_of(Series.of([])) == Strengths(0.0, 0.0, 0.0, FEW)
+    assert strengths_of(Series.of([np.zeros((0, 4))])) == Strengths(0.0, 0.0, 0.0, FEW)
+
+
+@pytest.mark.parametrize(("warmth", "range_degc"), [([-6.0, 0.0, 6.0], np.sqrt(24.0)), ([0.1, 0.2, 0.3], 1.0)])
+def test_of_single_sessions_the_slope_is_their_sd_over_the_temperatures_flown(
+    warmth: list[float], range_degc: float
+) -> None:
+    """Of three units, one session each, of which the median variance counts."""
+    rows = [np.array([[0.0, t, 7.0, v]]) for t, v in zip(warmth, (1.0, 4.0, 100.0), strict=True)]
+    series = Series.of(rows)
+    found = strengths_of(series)
+    assert (found.walk, found.scatter, found.freedom) == (0.0, 1.0, FEW)
+    assert found.slope == pytest.approx(4.0 / range_degc**2)
+    assert strengths_of(series, with_slope=False).slope == 0.0
+
+
+@pytest.mark.parametrize(
+    ("ratio", "expected"),
+    [
+        (0.25, 0.0),
+        (0.5, np.log(2.0)),
+        (25.0, np.log(100.0)),
+        (0.125, 4.0 * (1.0 - np.log(2.0))),
+        (0.025, 4.0 * (9.0 - np.log(10.0))),
+    ],
+)
+def test_a_variance_of_a_quarter_is_the_likeliest_and_less_the_unlikelier(ratio: float, expected: float) -> None:
+    """As four innovations of that variance would have it below, and above by an even chance for every magnitude."""
+    assert unlikely(ratio) == pytest.approx(expected)
+
+
+def test_the_largest_likely_strength_is_where_the_likelihood_has_fallen_by_half_a_standard_deviation() -> None:
+    best = np.array([1.0, -2.0])
+
+    def cost(x: np.ndarray) -> float:
+        return 5.0 + float((x[0] - 1.0) ** 2 + 4.0 * (x[1] + 2.0) ** 2)
+
+    for i, steep in ((0, 1.0), (1, 4.0)):
+        assert largest_likely(cost, best, 5.0, i) == pytest.approx(best[i] + np.sqrt(RISE / steep), abs=0.02)
+    np.testing.assert_array_equal(best, [1.0, -2.0])
+    # A likelihood that never falls so far tells nothing: the likeliest stays.
+    assert largest_likely(lambda x: 0.01 * x[0], best, 0.01, 0) == 1.0
