@@ -32,6 +32,6 @@ def with_what_belongs(
     """Information (p, p) and gradient (p,) of the record, `own`, with what is known beforehand of lag, arm, drift, …,
     which belongs to it; what is known of the triads does not."""
     beside = np.ones(len(known[1]), dtype=bool)
-    for name in TRIADS:
-        beside[layout.get(name, slice(0))] = False
+    for name, columns in layout.items():
+        beside[columns] = name not in TRIADS
     return own[0] + np.where(np.outer(beside, beside), known[0], 0.0), own[1] + np.where(beside, known[1], 0.0)

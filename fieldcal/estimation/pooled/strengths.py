@@ -120,8 +120,7 @@ def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_
     if not known.any():
         return Strengths(0.0, 0.0, 0.0, FEW)
     own = float(np.median(series.variance[known]))
-    gap = np.diff(series.day, axis=0)
-    gap_day = float(np.median(gap[np.isfinite(gap) & (gap > 0.0)])) if np.any(gap > 0.0) else 1.0
+    gap_day = usual_gap(series.day)
     warmth = series.warmth_degc[known]
     range_degc = max(float(np.std(warmth)), 1.0)
     expected = EXPECTED_SHARE**2 * own
@@ -139,11 +138,9 @@ def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_
         at = np.isfinite(z)
         started_anew = known.sum() - at.sum()
         likelihood = np.sum(np.log(variance[at] / own) + z[at] ** 2) + started_anew * RESTART_SD**2
-        few = unlikely(strengths.scatter / own)
-        few += FEW * np.log1p(strengths.walk * gap_day / strengths.scatter)
+        few = unlikely(strengths.scatter / own) + beside_scatter(strengths, gap_day, range_degc)
         if with_slope:
             few += unlikely(strengths.slope / units[2])
-            few += 0.5 * FEW * np.log1p(strengths.slope * range_degc**2 / strengths.scatter)
             variance = strengths.slope * within[:, 0] ** 2 + within[:, 2]
             few += np.sum(np.minimum(np.log(variance / own) + within[:, 1] ** 2 / variance, RESTART_SD**2))
         outside = np.sum(np.maximum(np.abs(x) - LIMITS[1], 0.0) ** 2)
@@ -164,6 +161,20 @@ def _starts(with_slope: bool) -> list[Array]:
     walk, scatter, slope = START
     times = TIMES if with_slope else TIMES[:1]
     return [np.array([walk * a, scatter * a, slope * b]) for a in TIMES for b in times]
+
+
+def usual_gap(day: Array) -> float:
+    """Median of the days (m, n) from one session to the next of a series, where there are two on two days; else 1."""
+    gap = np.diff(day, axis=0)
+    gap = gap[gap > 0.0]
+    return float(np.median(gap)) if len(gap) else 1.0
+
+
+def beside_scatter(strengths: Strengths, gap_day: float, range_degc: float) -> float:
+    """Minus twice the logarithm of the chance beforehand that what few innovations show is a walk or a slope, by how
+    much each does over the usual gap and the temperatures flown beside the scatter."""
+    walk = np.log1p(strengths.walk * gap_day / strengths.scatter)
+    return float(FEW * walk + 0.5 * FEW * np.log1p(strengths.slope * range_degc**2 / strengths.scatter))
 
 
 def _on_grid(value: float) -> float:

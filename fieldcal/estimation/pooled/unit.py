@@ -206,7 +206,7 @@ def pool(unit: Unit, kinds: Kinds, *, tested: bool = True) -> Pooled:
     freedom = np.array([kinds[name[:2]].freedom for name in unit.names])
     found = _smoothed(unit, kinds, (), (), ())
     while tested:
-        worst, step, drift = _worst_flight(found, freedom), _surest_step(found, freedom), _surest_drift(found, freedom)
+        worst, step, drift = _worst_flight(found, freedom), _surest_step(found, freedom), surest_drift(found, freedom)
         surest = min((one[0] for one in (worst, step, drift) if one is not None), default=None)
         if surest is None:
             break
@@ -269,9 +269,10 @@ def _smoothed(
     scatter = np.r_[[s.scatter for s in strengths], nothing]
     walk = np.r_[[s.walk for s in strengths], nothing]
     variance = np.array([strengths[k].slope for k in sloped])
-    flat = np.diag(np.r_[np.zeros(len(names)), 1.0 / np.maximum(variance, 1e-300), np.zeros(len(drifting))])
-    first = Known(np.where(flat > 1e290, 0.0, flat), np.zeros(len(flat)))
-    jump = np.zeros((len(unit.day) - 1, len(flat)))
+    flat = np.divide(1.0, variance, out=np.zeros(len(sloped)), where=variance > 0.0)
+    first = Known.nothing(len(scatter))
+    np.fill_diagonal(first.information, np.r_[np.zeros(len(names)), flat, np.zeros(len(drifting))])
+    jump = np.zeros((len(unit.day) - 1, len(scatter)))
     for step in steps:
         jump[step.after - 1, names.index(step.name)] = np.inf
     out = {one.flight for one in left_out}
@@ -346,7 +347,7 @@ def _surest_step(found: Pooled, freedom: Array) -> tuple[float, Step] | None:
     return float(chance[row, i]), Step(found.names[i], boundaries[row], float(size[row, i]), sd, float(z[row, i]))
 
 
-def _surest_drift(found: Pooled, freedom: Array) -> tuple[float, int] | None:
+def surest_drift(found: Pooled, freedom: Array) -> tuple[float, int] | None:
     """The constant whose steady change is the surest, if one's is and has moved it by more than a session scatters, and
     the logarithm of its chance."""
     informed = sum(bool(own.information.any()) for own in found.chain.own)
@@ -375,7 +376,7 @@ def jumps(past: Known, future: Known) -> tuple[Array, Array]:
     information = full - np.einsum("ij,jk,ki->i", n, covariance, n)
     right = future.right - n @ covariance @ together.right
     information = np.where(information > 1e-9 * np.maximum(full, 1e-300), information, 0.0)
-    return np.where(information > 0.0, right / np.where(information > 0.0, information, 1.0), 0.0), information
+    return np.divide(right, information, out=np.zeros_like(right), where=information > 0.0), information
 
 
 def strengths(units: Sequence[Unit], *, rounds: int = 2) -> dict[tuple[str, str], Strengths]:

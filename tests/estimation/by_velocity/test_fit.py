@@ -10,6 +10,7 @@ from outside_ci import outside_ci
 from velocity_support import epochs_of, errors, fitted, priors, readings_of, short_flight, with_readings
 
 import fieldcal.estimation.by_velocity.fit as by_velocity
+import fieldcal.estimation.by_velocity.start as start
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.by_velocity.fit import FEWEST_EPOCHS
 from fieldcal.estimation.by_velocity.information import observed
@@ -133,13 +134,22 @@ def test_what_clipped_residuals_do_not_tell_is_in_every_sd(monkeypatch: pytest.M
 
 
 def test_another_way_down_ends_at_the_same_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps of the levels that are longer or shorter, and a start that trusts the walks less."""
+    """Steps of the levels that are longer or shorter, a start that trusts the walks less or looks further about a knot,
+    an end that is nearer."""
     flight = short_flight("lively", 7)
     plain = errors(flight, fitted(flight))
-    for changed in ({"DAMPING": 0.75}, {"START_RATIO": 100.0}):
+    ways: tuple[dict[str, float], ...] = (
+        {"DAMPING": 0.75},
+        {"START_RATIO": 100.0},
+        {"ROUGH_ITERATIONS": 8},
+        {"UNDAMPED_ITERATIONS": 4},
+        {"CONVERGED_SD": 0.003, "CONVERGED_LEVEL": 0.003},
+        {"WINDOW_S": 8.0, "VELOCITY_SD_MPS": 0.4},
+    )
+    for changed in ways:
         with monkeypatch.context() as patch:
             for name, value in changed.items():
-                patch.setattr(by_velocity, name, value)
+                patch.setattr(by_velocity if hasattr(by_velocity, name) else start, name, value)
             for name, (error, sd) in errors(flight, fitted(flight)).items():
                 assert np.all(np.abs(error - plain[name][0]) < 0.1 * sd), (changed, name)
                 assert np.allclose(sd, plain[name][1], rtol=0.05)

@@ -131,10 +131,10 @@ def test_weights_fall_with_the_fourth_power_beyond_four_sd() -> None:
     """Of lengths by the median one, which is 1.538 of three normal numbers."""
     links, *_ = drawn_rows(np.random.default_rng(2), 8, 1)
     lengths = np.array([0.0, 1.0, 1.0, 2.6, 2.602, 5.2, 1.0, 0.5])
-    sd = np.array([1.0, 2.0, 4.0])
+    sd = np.outer([1.0, 3.0, 0.5, 2.0, 1.0, 0.2, 5.0, 1.0], [1.0, 2.0, 4.0])
     way = np.array([2.0, 1.0, -2.0]) / 3.0
     size = 7.0 * lengths[:, None] * way * sd
-    receiver = Rows(size, links.here, None, links.theta, np.arange(8), np.tile(sd**2, (8, 1)), (LEVEL, LEVEL, VERTICAL))
+    receiver = Rows(size, links.here, None, links.theta, np.arange(8), sd**2, (LEVEL, LEVEL, VERTICAL))
     of_links, found = robust_weights([links, receiver])
     np.testing.assert_array_equal(of_links, np.ones(links.residual.shape))
     distance = 1.538 * lengths
@@ -168,10 +168,13 @@ def test_level_and_vertical_velocity_and_the_field_have_colours_of_their_own() -
     links, receiver, field = drawn_rows(rng, 61, 1)
     m = len(receiver.knot)
     steadily, flipping = np.ones(m), np.where(np.arange(m) % 2, 1.0, -1.0)
-    whitened = [links.residual, np.column_stack([flipping, 3.0 * steadily, flipping]), np.ones((60, 3))]
+    of_field = np.ones((60, 3)) * [1.0, 2.0, 3.0]
+    of_field[::2, 1] *= -1.0
+    whitened = [links.residual, np.column_stack([flipping, 3.0 * steadily, flipping]), of_field]
     offset = np.arange(61.0)
     found = colours([links, receiver, field], whitened, offset)
     k = np.array([1, 2, 3])
-    of_flipping = 1.0 + 2.0 * np.sum((1.0 - k / 4.0) * (-1.0) ** k * (m - k) / m)
-    np.testing.assert_allclose(found, [0.1 * of_flipping + 0.9 * steady(m, 3), 1.0, steady(60, 3)], rtol=RTOL)
+    of_flipping, of_60 = (1.0 + 2.0 * np.sum((1.0 - k / 4.0) * (-1.0) ** k * (n - k) / n) for n in (m, 60))
+    expected = [0.1 * of_flipping + 0.9 * steady(m, 3), 1.0, (4.0 * of_60 + 10.0 * steady(60, 3)) / 14.0]
+    np.testing.assert_allclose(found, expected, rtol=RTOL)
     np.testing.assert_array_equal(colours([links, receiver], whitened[:2], offset)[2], 1.0)

@@ -18,6 +18,7 @@ from fieldcal.estimation.pooled.unit import (
     pool,
     series_of_sessions,
     state_of,
+    surest_drift,
     within_sessions,
 )
 from fieldcal.geometry.rotation import Array
@@ -248,3 +249,58 @@ def test_a_rate_that_was_named_is_of_the_state_and_takes_it_to_any_day() -> None
         pytest.approx(slope, rel=RTOL),
         pytest.approx(np.sqrt(1.5 * covariance[0, 0]), rel=1e-5),
     )
+
+
+def line(day: Array, value: Array, scatter: float) -> Pooled:
+    """Sessions of one constant without a walk, each known far better than it scatters."""
+    flights = [
+        Flight(NormalEquations((LEVER,), np.zeros(1), np.array([1e6 * v]), 1e6 * np.eye(1)), k, None)
+        for k, v in enumerate(value)
+    ]
+    return pool(Unit(tuple(flights), day), {LEVER[:2]: Strengths(0.0, scatter, 0.0)}, tested=False)
+
+
+@pytest.mark.parametrize(("sessions", "named"), [(4, False), (5, True)])
+def test_it_takes_five_sessions_to_name_a_drift(sessions: int, named: bool) -> None:
+    day = 100.0 + np.arange(float(sessions))
+    assert (surest_drift(line(day, 20.0 * day, 1.0), np.array([1e6])) is not None) == named
+
+
+@pytest.mark.parametrize(("moved", "named"), [(0.95, False), (1.05, True)])
+def test_a_drift_that_moved_less_than_sessions_scatter_is_not_named_however_sure(moved: float, named: bool) -> None:
+    day = 100.0 + np.arange(301.0)
+    found = line(day, 2.0 * moved * day / 300.0, 4.0)
+    assert (surest_drift(found, np.array([1e6])) is not None) == named
+
+
+def test_one_session_tells_no_rate() -> None:
+    assert line(np.zeros(1), np.ones(1), 1.0).rates() == [None]
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.04])
+def test_of_a_slope_that_no_flight_shows_its_siblings_are_known(slope: float) -> None:
+    """Flights at the reference temperature alone; without siblings nothing is."""
+    flight = Flight(NormalEquations((ZERO,), np.zeros(1), np.ones(1), np.eye(1)), 0, 0.0)
+    now = pool(Unit((flight,), np.zeros(1)), {ZERO[:2]: Strengths(0.0, 0.0, slope)}, tested=False).at()
+    assert now.covariance[1, 1] == pytest.approx(slope or np.inf)
+
+
+def test_what_neither_past_nor_future_tells_alone_is_no_jump_in_any_unit() -> None:
+    """Each knows one combination of two: whatever they are, there is a state that has both."""
+    for seed in range(20):
+        past, future = 1e4 * np.random.default_rng(seed).normal(size=(2, 2))
+        size, information = jumps(Known(np.outer(past, past), past), Known(np.outer(future, future), future))
+        assert not size.any()
+        assert not information.any()
+
+
+def test_of_a_constant_that_one_flight_of_a_session_does_not_see_there_is_no_difference() -> None:
+    def flight(names: tuple[tuple[str, str, str], ...], session: int, degc: float) -> Flight:
+        return Flight(
+            NormalEquations(names, np.zeros(len(names)), np.ones(len(names)), np.eye(len(names))), session, degc
+        )
+
+    flights = (flight((GAIN, ZERO), 0, 1.0), flight((GAIN,), 0, 5.0), flight((GAIN, ZERO), 1, 3.0))
+    kinds = {GAIN[:2]: Strengths(0.0, 0.1, 0.01), ZERO[:2]: Strengths(0.2, 0.1, 0.01)}
+    gain, zero = within_sessions(pool(Unit(flights, np.arange(2.0)), kinds, tested=False))
+    assert (gain.shape, zero.shape) == ((1, 3), (0, 3))

@@ -10,10 +10,12 @@ from fieldcal.estimation.pooled.strengths import (
     RISE,
     Series,
     Strengths,
+    beside_scatter,
     innovations,
     largest_likely,
     strengths_of,
     unlikely,
+    usual_gap,
 )
 
 
@@ -96,3 +98,31 @@ def test_the_largest_likely_strength_is_where_the_likelihood_has_fallen_by_half_
     np.testing.assert_array_equal(best, [1.0, -2.0])
     # A likelihood that never falls so far tells nothing: the likeliest stays.
     assert largest_likely(lambda x: 0.01 * x[0], best, 0.01, 0) == 1.0
+
+
+def test_the_usual_gap_is_the_median_of_days_between_sessions() -> None:
+    """Series of four, two and one session; two on the same day are not apart."""
+    day = np.array([[0.0, 5.0, 9.0], [2.0, 12.0, np.nan], [2.0, np.nan, np.nan], [6.0, np.nan, np.nan]])
+    assert usual_gap(day) == 4.0
+    assert usual_gap(day[:1]) == 1.0
+    assert usual_gap(np.array([[3.0], [3.0]])) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("strengths", "expected"),
+    [
+        (Strengths(0.0, 3.0, 0.0), 0.0),
+        (Strengths(0.25 * 3.0, 3.0, 0.0), 4.0 * np.log(2.0)),  # over four days as much as the scatter
+        (Strengths(0.0, 3.0, 3.0 / 36.0), 2.0 * np.log(2.0)),  # over 6 °C
+    ],
+)
+def test_a_walk_or_a_slope_as_large_as_the_scatter_is_that_unlikely(strengths: Strengths, expected: float) -> None:
+    assert beside_scatter(strengths, 4.0, 6.0) == pytest.approx(expected)
+
+
+def test_two_sessions_of_a_series_are_compared() -> None:
+    rng = np.random.default_rng(4)
+    rows = [np.column_stack([[0.0, 4.0], [0.0, 0.0], rng.normal(size=2), np.full(2, 0.01)]) for _ in range(30)]
+    found = strengths_of(Series.of(rows), with_slope=False)
+    assert 20.0 + FEW < found.freedom <= 30.0 + FEW
+    assert 0.4 < found.scatter < 2.0
