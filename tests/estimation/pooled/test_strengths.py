@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import fieldcal.estimation.pooled.strengths as module
 from fieldcal.estimation.pooled.strengths import (
     FEW,
     RISE,
@@ -126,3 +127,23 @@ def test_two_sessions_of_a_series_are_compared() -> None:
     found = strengths_of(Series.of(rows), with_slope=False)
     assert 20.0 + FEW < found.freedom <= 30.0 + FEW
     assert 0.4 < found.scatter < 2.0
+
+
+def test_another_start_and_a_nearer_end_find_the_same_strengths(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    rows = []
+    for _ in range(20):
+        day, warmth = np.cumsum(rng.uniform(1.0, 9.0, 12)), rng.uniform(-20.0, 10.0, 12)
+        value = 0.03 * rng.normal() * warmth + np.cumsum(0.1 * rng.normal(size=12)) + rng.normal(size=12)
+        rows.append(np.column_stack([day, warmth, value, np.full(12, 0.2)]))
+    plain = strengths_of(Series.of(rows))
+    for name, value in (
+        ("START", (0.3, 0.3, 0.3)),
+        ("TIMES", (1.2, 5.0, 20.0)),
+        ("TOLERANCES", {"fatol": 0.001, "xatol": 0.002}),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, value)
+            found = strengths_of(Series.of(rows))
+        for each in ("walk", "scatter", "slope"):
+            assert getattr(found, each) == pytest.approx(getattr(plain, each), rel=0.1), (name, each)
