@@ -14,6 +14,7 @@ import fieldcal.estimation.by_velocity.start as start
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.by_velocity.fit import FEWEST_EPOCHS
 from fieldcal.estimation.by_velocity.information import observed
+from fieldcal.estimation.by_velocity.problem import place_knots
 from fieldcal.geometry.rotation import angle_between
 
 RATE_HZ = 200.0
@@ -204,6 +205,32 @@ def test_a_short_record_is_refused() -> None:
         fitted(flight)
     assert error.value.reason_code == "velocity_too_short"
     assert len(epochs_of(flight).t) < FEWEST_EPOCHS
+
+
+@pytest.mark.parametrize(("epochs", "taken"), [(49, False), (50, True)])
+def test_it_takes_fifty_epochs_among_the_readings(epochs: int, taken: bool) -> None:
+    flight = short_flight("lively", 7)
+    placed = place_knots(readings_of(flight), epochs_of(flight)).epoch
+    last = placed[placed >= 0][epochs - 1] + 1  # those before the first reading at the longest lag are not counted
+    short = replace(
+        flight, gnss_t=flight.gnss_t[:last], gnss_velocity=flight.gnss_velocity[:last], gnss_sd=flight.gnss_sd[:last]
+    )
+    if taken:
+        assert len(fitted(short).t) == epochs
+    else:
+        with pytest.raises(UnusableFlight):
+            fitted(short)
+
+
+def test_a_magnetometer_of_nineteen_readings_is_left_out() -> None:
+    flight = short_flight("lively", 7)
+    few = np.full((len(flight.t), 3), np.nan)
+    at = np.linspace(200, len(flight.t) - 200, 19).astype(int)
+    few[at] = flight.counts["magnetometer"][at]
+    fit = fitted(flight, with_readings(flight, magnetometer=few))
+    assert "magnetometer" not in fit.layout
+    assert not fit.setting.lit.any()
+    assert fit.field_weight == 1.0
 
 
 def test_hover_tells_no_scale_of_an_accelerometer() -> None:
