@@ -2431,7 +2431,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     (
         "estimation.pooled.unit",
         "Pooled.rates",
-        "if information[i] > 1e-9 * n[d + i, d + i]:",
+        "if information[i] > 1e-9 * alone[i]:",
         "1e-09 → 1.1000000000000001e-09",
     ): _RCOND,
     (
@@ -2457,7 +2457,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("estimation.pooled.unit", "contradiction", "testable = spread < UNTESTABLE", "< → <="): _NEVER_MET,
     (
         "estimation.pooled.unit",
-        "_surest_step",
+        "surest_step",
         "if not chance[row, i] < np.log(FALSE_ALARMS / z.size):",
         "< → <=",
     ): _NEVER_MET,

@@ -140,9 +140,7 @@ def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_
         likelihood = np.sum(np.log(variance[at] / own) + z[at] ** 2) + started_anew * RESTART_SD**2
         few = unlikely(strengths.scatter / own) + beside_scatter(strengths, gap_day, range_degc)
         if with_slope:
-            few += unlikely(strengths.slope / units[2])
-            variance = strengths.slope * within[:, 0] ** 2 + within[:, 2]
-            few += np.sum(np.minimum(np.log(variance / own) + within[:, 1] ** 2 / variance, RESTART_SD**2))
+            few += unlikely(strengths.slope / units[2]) + of_pairs(within, strengths.slope, own)
         outside = np.sum(np.maximum(np.abs(x) - LIMITS[1], 0.0) ** 2)
         return float(likelihood + few + outside)
 
@@ -175,6 +173,13 @@ def beside_scatter(strengths: Strengths, gap_day: float, range_degc: float) -> f
     much each does over the usual gap and the temperatures flown beside the scatter."""
     walk = np.log1p(strengths.walk * gap_day / strengths.scatter)
     return float(FEW * walk + 0.5 * FEW * np.log1p(strengths.slope * range_degc**2 / strengths.scatter))
+
+
+def of_pairs(within: Array, slope: float, own: float) -> float:
+    """Minus twice the logarithm of the likelihood of differences `within` (k, 3) (of temperature and value, and the
+    variance of that) at a variance of slopes, over that of a session itself; one beyond RESTART_SD counts no more."""
+    variance = slope * within[:, 0] ** 2 + within[:, 2]
+    return float(np.sum(np.minimum(np.log(variance / own) + within[:, 1] ** 2 / variance, RESTART_SD**2)))
 
 
 def _on_grid(value: float) -> float:

@@ -141,10 +141,11 @@ class Pooled:
         size = np.sqrt(np.maximum(np.diagonal(n)[:d], 1e-300))
         inverse = np.linalg.pinv(n[:d, :d] / np.outer(size, size), rcond=1e-10, hermitian=True)
         beside = n[d:, :d] / size
-        information = np.diagonal(n)[d:] - np.einsum("ij,jk,ik->i", beside, inverse, beside)
+        alone = np.diagonal(n)[d:]
+        information = alone - np.einsum("ij,jk,ik->i", beside, inverse, beside)
         right = g[d:] - beside @ inverse @ (g[:d] / size)
         for i, place in enumerate(others):
-            if information[i] > 1e-9 * n[d + i, d + i]:
+            if information[i] > 1e-9 * alone[i]:
                 out[place] = Rate(float(right[i] / information[i]), float(1.0 / np.sqrt(information[i])))
         return out
 
@@ -204,9 +205,9 @@ def pool(unit: Unit, kinds: Kinds, *, tested: bool = True) -> Pooled:
     """Smooth a unit's flights; `tested`: look for steps and for flights that contradict the others, the surest first,
     until there is none."""
     freedom = np.array([kinds[name[:2]].freedom for name in unit.names])
-    found = _smoothed(unit, kinds, (), (), ())
+    found = smoothed(unit, kinds, (), (), ())
     while tested:
-        worst, step, drift = _worst_flight(found, freedom), _surest_step(found, freedom), surest_drift(found, freedom)
+        worst, step, drift = _worst_flight(found, freedom), surest_step(found, freedom), surest_drift(found, freedom)
         surest = min((one[0] for one in (worst, step, drift) if one is not None), default=None)
         if surest is None:
             break
@@ -217,7 +218,7 @@ def pool(unit: Unit, kinds: Kinds, *, tested: bool = True) -> Pooled:
             drifting = (*drifting, drift[1])
         elif worst is not None:
             left_out = (*left_out, worst[1])
-        found = _smoothed(unit, kinds, steps, left_out, drifting)
+        found = smoothed(unit, kinds, steps, left_out, drifting)
     return found
 
 
@@ -255,9 +256,10 @@ def state_of(
     return Known(design.T @ own.information @ design, design.T @ right)
 
 
-def _smoothed(
+def smoothed(
     unit: Unit, kinds: Kinds, steps: tuple[Step, ...], left_out: tuple[LeftOut, ...], drifting: tuple[int, ...]
 ) -> Pooled:
+    """A unit's flights with these steps, without those left out; constants `drifting` have rates in the state."""
     names, sloped = unit.names, tuple(k for k, name in enumerate(unit.names) if name[1] in SLOPED)
     usual, last = _usual_warmth(unit), float(unit.day[-1])
     raw = tuple(
@@ -326,7 +328,7 @@ def contradiction(own: Known, expected: Known) -> tuple[float, int]:
     return float(z2.sum()), int(testable.sum())
 
 
-def _surest_step(found: Pooled, freedom: Array) -> tuple[float, Step] | None:
+def surest_step(found: Pooled, freedom: Array) -> tuple[float, Step] | None:
     """The surest step of a constant between two sessions, if there is one, and the logarithm of its chance."""
     chain, p = found.chain, len(found.names)
     boundaries = range(FEWEST_BESIDE_A_STEP, len(chain.day) - FEWEST_BESIDE_A_STEP + 1)

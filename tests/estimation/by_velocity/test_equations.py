@@ -14,6 +14,7 @@ from fieldcal.estimation.by_velocity.equations import (
     TURN,
     VELOCITY_PER_M2S2,
     Rows,
+    field_at,
     noise_in_readings,
     predicted,
     pulls,
@@ -98,3 +99,19 @@ def test_noise_of_readings_is_counted_for_its_own_triad_and_not_where_jumps_are_
     assert squares[2] > n
     assert np.all(squares[[0, 1, 3, 4, 5]] < n)
     assert np.allclose(found, expected, rtol=1e-12)
+
+
+def test_a_field_of_the_same_strength_with_a_larger_dip_and_declination() -> None:
+    """Dip 60° and declination 130° that are 10° and 25° too small."""
+    strength, dip, declination = 0.7, np.radians(60.0), np.radians(130.0)
+
+    def field(dip: float, declination: float) -> np.ndarray:
+        level = strength * np.cos(dip)
+        return np.array([level * np.cos(declination), level * np.sin(declination), strength * np.sin(dip)])
+
+    by = np.radians([10.0, 25.0])
+    value, slopes = field_at(field(dip, declination), by)
+    np.testing.assert_allclose(value, field(*(np.array([dip, declination]) + by)), atol=1e-12)
+    for k, step in enumerate(1e-6 * np.eye(2)):
+        ahead, behind = (field(*(np.array([dip, declination]) + by + sign * step)) for sign in (1.0, -1.0))
+        np.testing.assert_allclose(slopes[:, k], (ahead - behind) / 2e-6, atol=1e-8)

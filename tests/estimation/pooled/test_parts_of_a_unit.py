@@ -11,14 +11,17 @@ from fieldcal.estimation.pooled.strengths import Strengths
 from fieldcal.estimation.pooled.unit import (
     Flight,
     Pooled,
+    Step,
     Unit,
     contradiction,
     first_strengths,
     jumps,
     pool,
     series_of_sessions,
+    smoothed,
     state_of,
     surest_drift,
+    surest_step,
     within_sessions,
 )
 from fieldcal.geometry.rotation import Array
@@ -53,6 +56,8 @@ def test_of_a_flight_that_sees_two_combinations_of_four_two_can_contradict() -> 
     assert count == 2
     assert chi2 == pytest.approx(off @ np.linalg.solve(np.eye(2) + a @ w @ a.T, off), rel=1e-5)
     assert contradiction(Known.nothing(4), expected) == (0.0, 0)
+    for unit in (1e-4, 1.0, 1e4):
+        assert contradiction(Known(unit**2 * np.eye(4), np.ones(4)), Known.nothing(4)) == (0.0, 0)
 
 
 @pytest.mark.parametrize(("variance", "count"), [(0.9e4, 1), (1.1e4, 0)])
@@ -129,8 +134,11 @@ WALK, SCATTER = 0.3, 0.5
 LEVERS = {("gyroscope", "lever"): Strengths(WALK, SCATTER, 0.0)}
 
 
-def with_rates(alone: list[tuple[Array, Array]], drifting: list[int]) -> tuple[Array, Array]:
-    """States (6, 3) and rates of some, of all sessions at once: state and covariance, states first."""
+def with_rates(
+    alone: list[tuple[Array, Array]], drifting: list[int], step: tuple[int, int] | None = None
+) -> tuple[Array, Array]:
+    """States (6, 3) and rates of some, of all sessions at once: state and covariance, states first. `step`: before this
+    session this element steps."""
     m, r = len(alone), len(drifting)
     n, g = np.zeros((3 * m + r, 3 * m + r)), np.zeros(3 * m + r)
     for k, (x, v) in enumerate(alone):
@@ -143,7 +151,8 @@ def with_rates(alone: list[tuple[Array, Array]], drifting: list[int]) -> tuple[A
         if k:
             h = np.zeros((3, 3 * m + r))
             h[:, 3 * k : 3 * k + 3], h[:, 3 * k - 3 : 3 * k] = np.eye(3), -np.eye(3)
-            n += h.T @ h / (WALK * (DAYS[k] - DAYS[k - 1]))
+            told = np.array([step != (k, i) for i in range(3)])
+            n += h[told].T @ h[told] / (WALK * (DAYS[k] - DAYS[k - 1]))
     covariance = np.linalg.inv(n)
     return covariance @ g, covariance
 
@@ -157,6 +166,16 @@ def test_the_rate_of_each_constant_is_that_of_least_squares_in_which_it_alone_dr
         assert rate.per_day == pytest.approx(state[-1], rel=RTOL)
         assert rate.sd == pytest.approx(np.sqrt(covariance[-1, -1]), rel=RTOL)
         assert rate.z == pytest.approx(state[-1] / np.sqrt(covariance[-1, -1]), rel=RTOL)
+
+
+def test_rates_beside_a_step_are_least_squares_too() -> None:
+    unit, alone = sessions_of(np.random.default_rng(8), DAYS)
+    step = Step(unit.names[0], 2, 0.0, 1.0, 0.0)
+    for place, rate in enumerate(smoothed(unit, LEVERS, (step,), (), ()).rates()):
+        state, covariance = with_rates(alone, [place], (2, 0))
+        assert rate is not None
+        assert rate.per_day == pytest.approx(state[-1], rel=RTOL)
+        assert rate.sd == pytest.approx(np.sqrt(covariance[-1, -1]), rel=RTOL)
 
 
 def test_the_last_session_against_all_others() -> None:
@@ -268,7 +287,7 @@ def test_it_takes_five_sessions_to_name_a_drift(sessions: int, named: bool) -> N
 
 @pytest.mark.parametrize(("moved", "named"), [(0.95, False), (1.05, True)])
 def test_a_drift_that_moved_less_than_sessions_scatter_is_not_named_however_sure(moved: float, named: bool) -> None:
-    day = 100.0 + np.arange(301.0)
+    day = 100.0 + np.r_[0.0, np.linspace(30.0, 300.0, 300)]
     found = line(day, 2.0 * moved * day / 300.0, 4.0)
     assert (surest_drift(found, np.array([1e6])) is not None) == named
 
@@ -304,3 +323,25 @@ def test_of_a_constant_that_one_flight_of_a_session_does_not_see_there_is_no_dif
     kinds = {GAIN[:2]: Strengths(0.0, 0.1, 0.01), ZERO[:2]: Strengths(0.2, 0.1, 0.01)}
     gain, zero = within_sessions(pool(Unit(flights, np.arange(2.0)), kinds, tested=False))
     assert (gain.shape, zero.shape) == ((1, 3), (0, 3))
+
+
+@pytest.mark.parametrize(("after", "named"), [(1, False), (2, True), (4, True), (5, False)])
+def test_it_takes_two_sessions_on_either_side_of_a_step(after: int, named: bool) -> None:
+    found = surest_step(line(np.arange(6.0), 20.0 * (np.arange(6) >= after), 1.0), np.array([1e6]))
+    assert (found is not None and found[1].after == after) == named
+    if found is not None and named:
+        assert found[1].size == pytest.approx(20.0, rel=1e-5)
+        assert found[1].sd == pytest.approx(np.sqrt(1.0 / after + 1.0 / (6 - after)), rel=1e-5)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
+def test_the_last_sessions_distance_is_the_same_in_any_unit(unit: float) -> None:
+    value = np.array([3.0, 4.0, 2.0, 9.0])
+    flights = [
+        Flight(NormalEquations((LEVER,), np.zeros(1), np.array([v / unit]), np.eye(1) / unit**2), k, None)
+        for k, v in enumerate(value)
+    ]
+    (z,) = pool(
+        Unit(tuple(flights), np.arange(4.0)), {LEVER[:2]: Strengths(0.0, 0.5 * unit**2, 0.0)}, tested=False
+    ).last_z()
+    assert z == pytest.approx(6.0 / np.sqrt(1.5 + 0.5), rel=1e-6)

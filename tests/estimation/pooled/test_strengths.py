@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import fieldcal.estimation.pooled.strengths as module
 from fieldcal.estimation.pooled.strengths import (
@@ -14,6 +15,7 @@ from fieldcal.estimation.pooled.strengths import (
     beside_scatter,
     innovations,
     largest_likely,
+    of_pairs,
     strengths_of,
     unlikely,
     usual_gap,
@@ -147,3 +149,15 @@ def test_another_start_and_a_nearer_end_find_the_same_strengths(monkeypatch: pyt
             found = strengths_of(Series.of(rows))
         for each in ("walk", "scatter", "slope"):
             assert getattr(found, each) == pytest.approx(getattr(plain, each), rel=0.1), (name, each)
+
+
+def test_two_flights_of_a_session_differ_as_likely_as_a_normal_number() -> None:
+    """Of variance slope · ΔT² + v, over a number of a session's own sd; of one far off the density does not count."""
+    pairs = np.array([[7.0, 1.5, 0.3], [-3.0, -2.0, 0.5], [1.0, 0.2, 0.4]])
+    slope, own = 0.04, 1.7
+    sd = np.sqrt([0.04 * 49.0 + 0.3, 0.04 * 9.0 + 0.5, 0.04 + 0.4])
+    expected = -2.0 * np.sum(norm.logpdf(pairs[:, 1], scale=sd) - norm.logpdf(0.0, scale=np.sqrt(own)))
+    assert of_pairs(pairs, slope, own) == pytest.approx(expected)
+    far = np.vstack([pairs, [[1.0, 100.0, 0.4]]])
+    assert of_pairs(far, slope, own) == pytest.approx(expected + 4.5**2)
+    assert of_pairs(np.zeros((0, 3)), slope, own) == 0.0
