@@ -2510,5 +2510,20 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "1 → 2",
     ): _ANY_NEGATIVE,
     ("estimation.pooled.chain", "Known.estimate", "seen = value > UNSEEN", "> → >="): _NEVER_MET,
+    ("estimation.by_velocity.equations", "solve", "flat = one.theta.reshape(-1, p)", "1 → 2"): _ANY_NEGATIVE,
+    ("estimation.by_velocity.equations", "solve", "own += flat.T @ weighted.reshape(-1, p)", "1 → 2"): _ANY_NEGATIVE,
+    (
+        "estimation.by_velocity.equations",
+        "solve",
+        "own_right += flat.T @ drawn.reshape(-1, rights)",
+        "1 → 2",
+    ): _ANY_NEGATIVE,
+    ("estimation.by_velocity.equations", "solve", "flat_right = right.reshape(-1, p + rights)", "1 → 2"): _ANY_NEGATIVE,
+    (
+        "estimation.by_velocity.equations",
+        "solve",
+        "absorbed = flat_right.T @ carried.reshape(-1, p + rights)",
+        "1 → 2",
+    ): _ANY_NEGATIVE,
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

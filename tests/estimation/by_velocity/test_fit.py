@@ -124,14 +124,20 @@ def test_outliers_change_nothing_much() -> None:
     np.testing.assert_array_equal(of_spoilt.t[outlier], np.intersect1d(flight.gnss_t[::25], of_spoilt.t))
 
 
-def test_what_clipped_residuals_do_not_tell_is_in_every_sd(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the factor that `huber_inflation` has of the receiver's weights, which is tested by itself."""
+def test_what_clipped_residuals_and_blocks_of_time_tell_is_in_every_sd(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the factors that `huber_inflation` and `wider` have, which are tested by themselves."""
     flight = short_flight("lively", 7)
-    covariance = []
-    for inflation in (1.0, 4.0):
+    fits = []
+    for inflation, factor in ((1.0, 1.0), (4.0, 1.0), (1.0, 3.0), (4.0, 3.0)):
         monkeypatch.setattr(by_velocity, "huber_inflation", lambda weights, inflation=inflation: inflation)
-        covariance.append(fitted(flight).covariance)
-    assert np.allclose(covariance[1], 4.0 * covariance[0], rtol=1e-9)
+        monkeypatch.setattr(
+            by_velocity, "wider", lambda rows, *rest, factor=factor: factor * np.ones(rows[0].theta.shape[2])
+        )
+        fits.append(fitted(flight))
+    for fit, by in zip(fits[1:], (2.0, 3.0, 6.0), strict=True):
+        assert np.allclose(fit.covariance, by**2 * fits[0].covariance, rtol=1e-9)
+        assert np.allclose(fit.information, fits[0].information / by**2, rtol=1e-9)
+        assert np.allclose(fit.pull, fits[0].pull / by, rtol=1e-9)
 
 
 def test_another_way_down_ends_at_the_same_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
