@@ -2525,5 +2525,11 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "absorbed = flat_right.T @ carried.reshape(-1, p + rights)",
         "1 → 2",
     ): _ANY_NEGATIVE,
+    (
+        "estimation.pooled.unit",
+        "jumps",
+        "information = np.where(information > 1e-9 * np.maximum(full, 1e-300), information, 0.0)",
+        "> → >=",
+    ): _NEVER_MET,
 }
 """(module, function or class, the line without its indentation, the change) → why no caller can tell the difference."""

@@ -101,17 +101,17 @@ NAMES = (GAIN, LEVER, ZERO)
 def test_a_flights_constants_are_those_of_the_state_at_its_temperature_and_day(
     warmth: float | None, counted: float
 ) -> None:
-    """The state: three constants, slopes of the gain and the zero, the rate of the zero, as of the last day."""
+    """The state: three constants, slopes of the gain and the zero, their rates, as of the last day."""
     rng = np.random.default_rng(7)
     own, x, _ = told(rng, 3)
     reference = rng.normal(size=3)
     equations = NormalEquations((ZERO, SLOPE, GAIN), reference, own.right, own.information)
-    found = state_of(Flight(equations, 0, warmth), NAMES, (0, 2), -2.5, (2,), -40.0)
+    found = state_of(Flight(equations, 0, warmth), NAMES, (0, 2), -2.5, (0, 2), -40.0)
     design = np.array(
         [
-            [0.0, 0.0, 1.0, 0.0, counted, -40.0],  # zero
-            [0.0, 0.0, 0.0, 0.0, 1.0, 0.0],  # its slope
-            [1.0, 0.0, 0.0, counted, 0.0, 0.0],  # gain
+            [0.0, 0.0, 1.0, 0.0, counted, 0.0, -40.0],  # zero
+            [0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0],  # its slope
+            [1.0, 0.0, 0.0, counted, 0.0, -40.0, 0.0],  # gain
         ]
     )
     np.testing.assert_allclose(found.information, design.T @ own.information @ design)
