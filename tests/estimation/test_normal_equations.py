@@ -38,7 +38,7 @@ def test_an_other_one_of_which_something_is_known_is_eliminated_whatever_else_is
     information[:2, :2] = [[2.0, 1.0], [1.0, 2.0]]
     information[2, 2] = 3.0
     some = NormalEquations(NAMES, np.zeros(5), np.array([1.0, 4.0, 0.0, 0.0, 0.0]), information).of(NAMES[:1])
-    assert (some.information[0, 0], some.right[0]) == (1.5, -1.0)
+    assert (some.information[0, 0], some.right[0]) == (pytest.approx(1.5), pytest.approx(-1.0))
 
 
 def test_what_is_known_only_beside_an_unknown_other_is_not_known() -> None:
@@ -81,3 +81,23 @@ def test_doubt_adds_to_the_covariance_of_what_is_known_and_to_nothing_else(rows:
     seen = h @ pseudo_inverse(doubted.information) @ h.T
     if rows == 2:
         np.testing.assert_allclose(seen, np.eye(2) + h @ doubt @ h.T, rtol=1e-6)
+
+
+def test_by_their_triangle_they_are_the_same() -> None:
+    found, _, _ = made(9)
+    rows = found.triangle()
+    assert [len(row) for row in rows] == [1, 2, 3, 4, 5]
+    flat = np.concatenate(rows)
+    again = NormalEquations.of_triangle(list(NAMES), found.reference, found.right, flat)
+    np.testing.assert_array_equal(again.information, found.information)
+    assert flat[4] == found.information[2, 1]
+    assert (again.names, again.right is found.right) == (NAMES, True)
+
+
+def test_what_may_be_rounding_of_a_difference_is_nothing() -> None:
+    """Another parameter takes all but 1e-10 of what is known, or a little more or less."""
+    for left, kept in ((1.05e-10, True), (0.95e-10, False)):
+        information = np.array([[4.0, 2.0], [2.0, 1.0 / (1.0 - left)]])
+        some = NormalEquations(NAMES[:2], np.zeros(2), np.array([1.0, 2.0]), information).of(NAMES[:1])
+        assert bool(some.information.any()) == kept
+        assert bool(some.right.any()) == kept

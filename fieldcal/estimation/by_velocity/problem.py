@@ -79,7 +79,7 @@ def place_knots(readings: Readings, epochs: Epochs) -> Knots:
                 continue
             linked = bool(apart <= LONGEST_BRIDGE_S)
             parts = int(np.ceil(apart / KNOT_SPACING_S)) if linked else 1
-            between = list(before + apart * np.arange(1, parts) / parts) if linked else []
+            between = list(before + apart * np.arange(1, parts) / parts)
             offset += [*between, float(epochs.t[k])]
             epoch += [*[-1] * len(between), int(k)]
             joined += [linked] * (len(between) + 1)

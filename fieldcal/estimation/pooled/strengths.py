@@ -120,8 +120,7 @@ def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_
     if not known.any():
         return Strengths(0.0, 0.0, 0.0, FEW)
     own = float(np.median(series.variance[known]))
-    gap = np.diff(series.day, axis=0)
-    gap_day = float(np.median(gap[np.isfinite(gap) & (gap > 0.0)])) if np.any(gap > 0.0) else 1.0
+    gap_day = usual_gap(series.day)
     warmth = series.warmth_degc[known]
     range_degc = max(float(np.std(warmth)), 1.0)
     expected = EXPECTED_SHARE**2 * own
@@ -139,13 +138,9 @@ def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_
         at = np.isfinite(z)
         started_anew = known.sum() - at.sum()
         likelihood = np.sum(np.log(variance[at] / own) + z[at] ** 2) + started_anew * RESTART_SD**2
-        few = _unlikely(strengths.scatter / own)
-        few += FEW * np.log1p(strengths.walk * gap_day / strengths.scatter)
+        few = unlikely(strengths.scatter / own) + beside_scatter(strengths, gap_day, range_degc)
         if with_slope:
-            few += _unlikely(strengths.slope / units[2])
-            few += 0.5 * FEW * np.log1p(strengths.slope * range_degc**2 / strengths.scatter)
-            variance = strengths.slope * within[:, 0] ** 2 + within[:, 2]
-            few += np.sum(np.minimum(np.log(variance / own) + within[:, 1] ** 2 / variance, RESTART_SD**2))
+            few += unlikely(strengths.slope / units[2]) + of_pairs(within, strengths.slope, own)
         outside = np.sum(np.maximum(np.abs(x) - LIMITS[1], 0.0) ** 2)
         return float(likelihood + few + outside)
 
@@ -153,7 +148,7 @@ def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_
     start = min((np.log(np.square(at[:size])) for at in _starts(with_slope)), key=cost)
     simplex = start + np.eye(size + 1, size, -1)
     best = minimize(cost, start, method="Nelder-Mead", options={**TOLERANCES, "initial_simplex": simplex})
-    most = [_largest_likely(cost, best.x, best.fun, i) for i in range(size)]
+    most = [largest_likely(cost, best.x, best.fun, i) for i in range(size)]
     found = given(np.array(most))
     return replace(found, freedom=FEW + float(np.isfinite(innovations(series, found)[0]).sum()))
 
@@ -166,18 +161,39 @@ def _starts(with_slope: bool) -> list[Array]:
     return [np.array([walk * a, scatter * a, slope * b]) for a in TIMES for b in times]
 
 
+def usual_gap(day: Array) -> float:
+    """Median of the days (m, n) from one session to the next of a series, where there are two on two days; else 1."""
+    gap = np.diff(day, axis=0)
+    gap = gap[gap > 0.0]
+    return float(np.median(gap)) if len(gap) else 1.0
+
+
+def beside_scatter(strengths: Strengths, gap_day: float, range_degc: float) -> float:
+    """Minus twice the logarithm of the chance beforehand that what few innovations show is a walk or a slope, by how
+    much each does over the usual gap and the temperatures flown beside the scatter."""
+    walk = np.log1p(strengths.walk * gap_day / strengths.scatter)
+    return float(FEW * walk + 0.5 * FEW * np.log1p(strengths.slope * range_degc**2 / strengths.scatter))
+
+
+def of_pairs(within: Array, slope: float, own: float) -> float:
+    """Minus twice the logarithm of the likelihood of differences `within` (k, 3) (of temperature and value, and the
+    variance of that) at a variance of slopes, over that of a session itself; one beyond RESTART_SD counts no more."""
+    variance = slope * within[:, 0] ** 2 + within[:, 2]
+    return float(np.sum(np.minimum(np.log(variance / own) + within[:, 1] ** 2 / variance, RESTART_SD**2)))
+
+
 def _on_grid(value: float) -> float:
     return float(GRID ** np.round(np.log(value) / np.log(GRID))) if value > 0.0 else 0.0
 
 
-def _unlikely(ratio: float) -> float:
+def unlikely(ratio: float) -> float:
     """Minus twice the logarithm of the chance of a variance beforehand, over that of a session itself: much less than
     expected is unlikely, much more hardly, for sessions may be known ever so well."""
     above = np.log(ratio / EXPECTED_SHARE**2)
     return float(above if above > 0.0 else FEW * (above + EXPECTED_SHARE**2 / ratio - 1.0))
 
 
-def _largest_likely(cost: Callable[[Array], float], best: Array, least: float, i: int) -> float:
+def largest_likely(cost: Callable[[Array], float], best: Array, least: float, i: int) -> float:
     """The largest element i of x that is likely (`RISE`): a strength that the fleet hardly shows is
     not taken for none."""
     low, high = float(best[i]), LIMITS[1]

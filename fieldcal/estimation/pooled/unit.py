@@ -141,10 +141,11 @@ class Pooled:
         size = np.sqrt(np.maximum(np.diagonal(n)[:d], 1e-300))
         inverse = np.linalg.pinv(n[:d, :d] / np.outer(size, size), rcond=1e-10, hermitian=True)
         beside = n[d:, :d] / size
-        information = np.diagonal(n)[d:] - np.einsum("ij,jk,ik->i", beside, inverse, beside)
+        alone = np.diagonal(n)[d:]
+        information = alone - np.einsum("ij,jk,ik->i", beside, inverse, beside)
         right = g[d:] - beside @ inverse @ (g[:d] / size)
         for i, place in enumerate(others):
-            if information[i] > 1e-9 * n[d + i, d + i]:
+            if information[i] > 1e-9 * alone[i]:
                 out[place] = Rate(float(right[i] / information[i]), float(1.0 / np.sqrt(information[i])))
         return out
 
@@ -204,9 +205,9 @@ def pool(unit: Unit, kinds: Kinds, *, tested: bool = True) -> Pooled:
     """Smooth a unit's flights; `tested`: look for steps and for flights that contradict the others, the surest first,
     until there is none."""
     freedom = np.array([kinds[name[:2]].freedom for name in unit.names])
-    found = _smoothed(unit, kinds, (), (), ())
+    found = smoothed(unit, kinds, (), (), ())
     while tested:
-        worst, step, drift = _worst_flight(found, freedom), _surest_step(found, freedom), _surest_drift(found, freedom)
+        worst, step, drift = _worst_flight(found, freedom), surest_step(found, freedom), surest_drift(found, freedom)
         surest = min((one[0] for one in (worst, step, drift) if one is not None), default=None)
         if surest is None:
             break
@@ -217,7 +218,7 @@ def pool(unit: Unit, kinds: Kinds, *, tested: bool = True) -> Pooled:
             drifting = (*drifting, drift[1])
         elif worst is not None:
             left_out = (*left_out, worst[1])
-        found = _smoothed(unit, kinds, steps, left_out, drifting)
+        found = smoothed(unit, kinds, steps, left_out, drifting)
     return found
 
 
@@ -255,9 +256,10 @@ def state_of(
     return Known(design.T @ own.information @ design, design.T @ right)
 
 
-def _smoothed(
+def smoothed(
     unit: Unit, kinds: Kinds, steps: tuple[Step, ...], left_out: tuple[LeftOut, ...], drifting: tuple[int, ...]
 ) -> Pooled:
+    """A unit's flights with these steps, without those left out; constants `drifting` have rates in the state."""
     names, sloped = unit.names, tuple(k for k, name in enumerate(unit.names) if name[1] in SLOPED)
     usual, last = _usual_warmth(unit), float(unit.day[-1])
     raw = tuple(
@@ -269,9 +271,10 @@ def _smoothed(
     scatter = np.r_[[s.scatter for s in strengths], nothing]
     walk = np.r_[[s.walk for s in strengths], nothing]
     variance = np.array([strengths[k].slope for k in sloped])
-    flat = np.diag(np.r_[np.zeros(len(names)), 1.0 / np.maximum(variance, 1e-300), np.zeros(len(drifting))])
-    first = Known(np.where(flat > 1e290, 0.0, flat), np.zeros(len(flat)))
-    jump = np.zeros((len(unit.day) - 1, len(flat)))
+    flat = np.divide(1.0, variance, out=np.zeros(len(sloped)), where=variance > 0.0)
+    first = Known.nothing(len(scatter))
+    np.fill_diagonal(first.information, np.r_[np.zeros(len(names)), flat, np.zeros(len(drifting))])
+    jump = np.zeros((len(unit.day) - 1, len(scatter)))
     for step in steps:
         jump[step.after - 1, names.index(step.name)] = np.inf
     out = {one.flight for one in left_out}
@@ -325,7 +328,7 @@ def contradiction(own: Known, expected: Known) -> tuple[float, int]:
     return float(z2.sum()), int(testable.sum())
 
 
-def _surest_step(found: Pooled, freedom: Array) -> tuple[float, Step] | None:
+def surest_step(found: Pooled, freedom: Array) -> tuple[float, Step] | None:
     """The surest step of a constant between two sessions, if there is one, and the logarithm of its chance."""
     chain, p = found.chain, len(found.names)
     boundaries = range(FEWEST_BESIDE_A_STEP, len(chain.day) - FEWEST_BESIDE_A_STEP + 1)
@@ -346,7 +349,7 @@ def _surest_step(found: Pooled, freedom: Array) -> tuple[float, Step] | None:
     return float(chance[row, i]), Step(found.names[i], boundaries[row], float(size[row, i]), sd, float(z[row, i]))
 
 
-def _surest_drift(found: Pooled, freedom: Array) -> tuple[float, int] | None:
+def surest_drift(found: Pooled, freedom: Array) -> tuple[float, int] | None:
     """The constant whose steady change is the surest, if one's is and has moved it by more than a session scatters, and
     the logarithm of its chance."""
     informed = sum(bool(own.information.any()) for own in found.chain.own)
@@ -375,19 +378,19 @@ def jumps(past: Known, future: Known) -> tuple[Array, Array]:
     information = full - np.einsum("ij,jk,ki->i", n, covariance, n)
     right = future.right - n @ covariance @ together.right
     information = np.where(information > 1e-9 * np.maximum(full, 1e-300), information, 0.0)
-    return np.where(information > 0.0, right / np.where(information > 0.0, information, 1.0), 0.0), information
+    return np.divide(right, information, out=np.zeros_like(right), where=information > 0.0), information
 
 
 def strengths(units: Sequence[Unit], *, rounds: int = 2) -> dict[tuple[str, str], Strengths]:
     """How much each kind of constant moves, of all units: what sessions say of a constant, given what the others say
     of all others, is a series of `strengths_of`. Coarse (`Strengths.coarse`)."""
-    kinds = _first_strengths(units)
+    kinds = first_strengths(units)
     for _ in range(rounds):
         rows: dict[tuple[str, str], list[Array]] = {kind: [] for kind in kinds}
         within: dict[tuple[str, str], list[Array]] = {kind: [] for kind in kinds}
         for unit in units:
             found = pool(unit, kinds, tested=False)
-            for name, series, pairs in zip(found.names, _series(found), _within_sessions(found), strict=True):
+            for name, series, pairs in zip(found.names, series_of_sessions(found), within_sessions(found), strict=True):
                 rows[name[:2]].append(series)
                 within[name[:2]].append(pairs)
         kinds = {
@@ -401,7 +404,7 @@ def strengths(units: Sequence[Unit], *, rounds: int = 2) -> dict[tuple[str, str]
     return {kind: strengths.coarse() for kind, strengths in kinds.items()}
 
 
-def _first_strengths(units: Sequence[Unit]) -> dict[tuple[str, str], Strengths]:
+def first_strengths(units: Sequence[Unit]) -> dict[tuple[str, str], Strengths]:
     """To begin with: constants scatter as a flight alone sees them, and change by as much over a degree."""
     own: dict[tuple[str, str], list[float]] = {}
     for unit in units:
@@ -415,7 +418,7 @@ def _first_strengths(units: Sequence[Unit]) -> dict[tuple[str, str], Strengths]:
     return {name[:2]: kinds.get(name[:2], Strengths(0.0, 0.0, 0.0)) for unit in units for name in unit.names}
 
 
-def _series(found: Pooled) -> list[Array]:
+def series_of_sessions(found: Pooled) -> list[Array]:
     """Of each constant (sessions, 4): day, temperature less the reference, value there and its variance, as the session
     alone says where the other constants are what the other sessions say: what is known of the value with the session
     less what is without."""
@@ -447,7 +450,7 @@ def said_beside(before: Estimate, together: Estimate, combination: Array) -> tup
     return (x / v - (x_others * known if known else 0.0)) / information, 1.0 / information
 
 
-def _within_sessions(found: Pooled) -> list[Array]:
+def within_sessions(found: Pooled) -> list[Array]:
     """Of each constant (k, 3): how two flights of a session, one after the other, differ in temperature and value, and
     the variance of that; the other constants as the other sessions and the one flight know them."""
     pairs: list[list[tuple[float, float, float]]] = [[] for _ in found.names]

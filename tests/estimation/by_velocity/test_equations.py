@@ -4,74 +4,39 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rows_by_velocity import dense, drawn_rows
 
 from fieldcal.estimation.by_velocity.equations import (
     ATTITUDE_PER_RAD2,
-    FIELD,
     GROUPS,
-    LEVEL,
     PUSH,
     STATES,
     TURN,
     VELOCITY_PER_M2S2,
-    VERTICAL,
     Rows,
+    field_at,
     noise_in_readings,
     predicted,
     pulls,
     solve,
 )
 from fieldcal.estimation.by_velocity.problem import State
-from fieldcal.geometry.rotation import Array, body_from_inertial, normalise
+from fieldcal.geometry.rotation import body_from_inertial, normalise
 
 KNOTS, P = 6, 7
-
-
-def some_rows(rng: np.random.Generator) -> list[Rows]:
-    """Links of each knot to the next, epochs and means at some: sensitivities drawn at random."""
-
-    def one(knot: np.ndarray, group: tuple[int, ...], linked: bool) -> Rows:
-        m, r = len(knot), len(group)
-        there = rng.normal(size=(m, r, STATES)) if linked else None
-        here, theta = rng.normal(size=(m, r, STATES)), rng.normal(size=(m, r, P))
-        return Rows(rng.normal(size=(m, r)), here, there, theta, knot, rng.uniform(0.1, 2.0, (m, r)), group)
-
-    return [
-        one(np.arange(KNOTS - 1), (TURN, TURN, TURN, PUSH, PUSH, PUSH), True),
-        one(np.array([0, 2, 3, 5]), (LEVEL, LEVEL, VERTICAL), False),
-        one(np.arange(KNOTS - 1), (FIELD,) * 3, False),
-    ]
-
-
-def dense(rows: list[Rows], weight: list[Array]) -> tuple[Array, Array, np.ndarray]:
-    """All rows whitened, (M, 6K + P), with their residuals (M,) and groups (M,)."""
-    lines, right, group = [], [], []
-    for one, robust in zip(rows, weight, strict=True):
-        for m, knot in enumerate(one.knot):
-            for r in range(one.residual.shape[1]):
-                line = np.zeros(STATES * KNOTS + P)
-                line[STATES * knot : STATES * (knot + 1)] = one.here[m, r]
-                if one.there is not None:
-                    line[STATES * (knot + 1) : STATES * (knot + 2)] = one.there[m, r]
-                line[STATES * KNOTS :] = one.theta[m, r]
-                root = np.sqrt(robust[m, r] / one.variance[m, r])
-                lines.append(root * line)
-                right.append(-root * one.residual[m, r])
-                group.append(one.group[r])
-    return np.array(lines), np.array(right), np.array(group)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_step_is_that_of_dense_least_squares(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    rows = some_rows(rng)
+    rows = drawn_rows(rng, KNOTS, P)
     weight = [rng.uniform(0.3, 1.0, one.residual.shape) for one in rows]
     signs = [rng.choice([-1.0, 1.0], one.residual.shape) for one in rows]
     prior = np.diag(rng.uniform(0.1, 1.0, P))
     pulled, score = rng.normal(size=P), rng.normal(size=P)
     found = solve(rows, weight, KNOTS, (prior, pulled), score, signs)
 
-    a, b, group = dense(rows, weight)
+    a, b, group = dense(rows, weight, KNOTS)
     n = STATES * KNOTS
     known = np.zeros((n + P, n + P))
     known[:n, :n] = np.diag(np.tile([ATTITUDE_PER_RAD2] * 3 + [VELOCITY_PER_M2S2] * 3, KNOTS))
@@ -134,3 +99,19 @@ def test_noise_of_readings_is_counted_for_its_own_triad_and_not_where_jumps_are_
     assert squares[2] > n
     assert np.all(squares[[0, 1, 3, 4, 5]] < n)
     assert np.allclose(found, expected, rtol=1e-12)
+
+
+def test_a_field_of_the_same_strength_with_a_larger_dip_and_declination() -> None:
+    """Dip 60° and declination 130° that are 10° and 25° too small."""
+    strength, dip, declination = 0.7, np.radians(60.0), np.radians(130.0)
+
+    def field(dip: float, declination: float) -> np.ndarray:
+        level = strength * np.cos(dip)
+        return np.array([level * np.cos(declination), level * np.sin(declination), strength * np.sin(dip)])
+
+    by = np.radians([10.0, 25.0])
+    value, slopes = field_at(field(dip, declination), by)
+    np.testing.assert_allclose(value, field(*(np.array([dip, declination]) + by)), atol=1e-12)
+    for k, step in enumerate(1e-6 * np.eye(2)):
+        ahead, behind = (field(*(np.array([dip, declination]) + by + sign * step)) for sign in (1.0, -1.0))
+        np.testing.assert_allclose(slopes[:, k], (ahead - behind) / 2e-6, atol=1e-8)

@@ -10,9 +10,11 @@ from outside_ci import outside_ci
 from velocity_support import epochs_of, errors, fitted, priors, readings_of, short_flight, with_readings
 
 import fieldcal.estimation.by_velocity.fit as by_velocity
+import fieldcal.estimation.by_velocity.start as start
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.by_velocity.fit import FEWEST_EPOCHS
 from fieldcal.estimation.by_velocity.information import observed
+from fieldcal.estimation.by_velocity.problem import place_knots
 from fieldcal.geometry.rotation import angle_between
 
 RATE_HZ = 200.0
@@ -113,29 +115,48 @@ def test_outliers_change_nothing_much() -> None:
     flight = short_flight("lively", 7)
     wrong = flight.gnss_velocity.copy()
     wrong[::25] += 8.0
-    clean, spoilt = (errors(f, fitted(f)) for f in (flight, replace(flight, gnss_velocity=wrong)))
+    of_spoilt = fitted(replace(flight, gnss_velocity=wrong))
+    clean, spoilt = errors(flight, fitted(flight)), errors(flight, of_spoilt)
     for name, (error, sd) in clean.items():
         assert np.all(np.abs(spoilt[name][0] - error) < sd), name
+    outlier = of_spoilt.weight < 0.1
+    np.testing.assert_allclose(of_spoilt.residual[outlier], 8.0, atol=1.5)
+    np.testing.assert_array_equal(of_spoilt.t[outlier], np.intersect1d(flight.gnss_t[::25], of_spoilt.t))
 
 
-def test_what_clipped_residuals_do_not_tell_is_in_every_sd(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the factor that `huber_inflation` has of the receiver's weights, which is tested by itself."""
+def test_what_clipped_residuals_and_blocks_of_time_tell_is_in_every_sd(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the factors that `huber_inflation` and `wider` have, which are tested by themselves."""
     flight = short_flight("lively", 7)
-    covariance = []
-    for inflation in (1.0, 4.0):
+    fits = []
+    for inflation, factor in ((1.0, 1.0), (4.0, 1.0), (1.0, 3.0), (4.0, 3.0)):
         monkeypatch.setattr(by_velocity, "huber_inflation", lambda weights, inflation=inflation: inflation)
-        covariance.append(fitted(flight).covariance)
-    assert np.allclose(covariance[1], 4.0 * covariance[0], rtol=1e-9)
+        monkeypatch.setattr(
+            by_velocity, "wider", lambda rows, *rest, factor=factor: factor * np.ones(rows[0].theta.shape[2])
+        )
+        fits.append(fitted(flight))
+    for fit, by in zip(fits[1:], (2.0, 3.0, 6.0), strict=True):
+        assert np.allclose(fit.covariance, by**2 * fits[0].covariance, rtol=1e-9)
+        assert np.allclose(fit.information, fits[0].information / by**2, rtol=1e-9)
+        assert np.allclose(fit.pull, fits[0].pull / by, rtol=1e-9)
 
 
 def test_another_way_down_ends_at_the_same_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps of the levels that are longer or shorter, and a start that trusts the walks less."""
+    """Steps of the levels that are longer or shorter, a start that trusts the walks less or looks further about a knot,
+    an end that is nearer."""
     flight = short_flight("lively", 7)
     plain = errors(flight, fitted(flight))
-    for changed in ({"DAMPING": 0.75}, {"START_RATIO": 100.0}):
+    ways: tuple[dict[str, float], ...] = (
+        {"DAMPING": 0.75},
+        {"START_RATIO": 100.0},
+        {"ROUGH_ITERATIONS": 8},
+        {"UNDAMPED_ITERATIONS": 4},
+        {"CONVERGED_SD": 0.003, "CONVERGED_LEVEL": 0.003},
+        {"WINDOW_S": 8.0, "VELOCITY_SD_MPS": 0.4},
+    )
+    for changed in ways:
         with monkeypatch.context() as patch:
             for name, value in changed.items():
-                patch.setattr(by_velocity, name, value)
+                patch.setattr(by_velocity if hasattr(by_velocity, name) else start, name, value)
             for name, (error, sd) in errors(flight, fitted(flight)).items():
                 assert np.all(np.abs(error - plain[name][0]) < 0.1 * sd), (changed, name)
                 assert np.allclose(sd, plain[name][1], rtol=0.05)
@@ -174,6 +195,14 @@ def test_information_is_the_estimate_less_what_was_known() -> None:
         expected[at] = np.sqrt(np.diagonal(_of_gains(scale, bias, covariance)))
     # With the prior put back, in gains and zeros, it is the estimate again.
     assert np.allclose(np.sqrt(np.diagonal(np.linalg.inv(total))), expected, rtol=0.05)
+    # And there the record pulls as far away from the prior as the prior pulls back.
+    pull = found.right.copy()
+    for name, prior in known.items():
+        at = [k for k, parameter in enumerate(found.names) if parameter[0] == name]
+        information = np.linalg.inv(_of_gains(prior.scale, prior.bias, prior.covariance))
+        gain_and_zero = np.r_[1.0 / prior.scale, -prior.bias / prior.scale]
+        pull[at] += information @ (gain_and_zero - found.reference[at])
+    assert np.all(np.abs(np.linalg.solve(total, pull)) < 0.1 * expected)
 
 
 def test_a_short_record_is_refused() -> None:
@@ -182,6 +211,32 @@ def test_a_short_record_is_refused() -> None:
         fitted(flight)
     assert error.value.reason_code == "velocity_too_short"
     assert len(epochs_of(flight).t) < FEWEST_EPOCHS
+
+
+@pytest.mark.parametrize(("epochs", "taken"), [(49, False), (50, True)])
+def test_it_takes_fifty_epochs_among_the_readings(epochs: int, taken: bool) -> None:
+    flight = short_flight("lively", 7)
+    placed = place_knots(readings_of(flight), epochs_of(flight)).epoch
+    last = placed[placed >= 0][epochs - 1] + 1  # those before the first reading at the longest lag are not counted
+    short = replace(
+        flight, gnss_t=flight.gnss_t[:last], gnss_velocity=flight.gnss_velocity[:last], gnss_sd=flight.gnss_sd[:last]
+    )
+    if taken:
+        assert len(fitted(short).t) == epochs
+    else:
+        with pytest.raises(UnusableFlight):
+            fitted(short)
+
+
+def test_a_magnetometer_of_nineteen_readings_is_left_out() -> None:
+    flight = short_flight("lively", 7)
+    few = np.full((len(flight.t), 3), np.nan)
+    at = np.linspace(200, len(flight.t) - 200, 19).astype(int)
+    few[at] = flight.counts["magnetometer"][at]
+    fit = fitted(flight, with_readings(flight, magnetometer=few))
+    assert "magnetometer" not in fit.layout
+    assert not fit.setting.lit.any()
+    assert fit.field_weight == 1.0
 
 
 def test_hover_tells_no_scale_of_an_accelerometer() -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from velocity_support import epochs_of, readings_of, short_flight
 
-from fieldcal.estimation.by_velocity.problem import place_knots
+from fieldcal.estimation.by_velocity.problem import Knots, place_knots
 from fieldcal.estimation.by_velocity.strapdown import Grid, Integrated, grid_of, integrate
+from fieldcal.estimation.joint.problem import Readings
 from fieldcal.geometry.rotation import Array, from_matrix, multiply, to_rotation_vector
 
 UNIT = np.r_[np.ones(3), np.zeros(3)]
@@ -78,3 +80,74 @@ def test_true_readings_give_the_true_motion() -> None:
     gravity = np.array([0.0, 0.0, flight.experiment.gravity_mps2])
     change = np.diff(flight.gnss_velocity[knots.epoch], axis=0)
     assert np.abs(push + gravity * np.diff(knots.offset)[:, None] - change).max() < 2e-3
+
+
+T = np.arange(401) / 100.0
+"""4 s; knots at 0.5, 1.5, 2.5 and 3.5 s on the IMU's clock."""
+SCALE, ZERO = np.array([0.9, 1.1, 1.2]), np.array([0.02, -0.01, 0.03])
+
+
+def integrated(gyroscope: Array, accelerometer: Array, magnetometer: Array | None, drift: Array) -> Integrated:
+    lag_s = 0.25
+    readings = Readings(
+        T,
+        np.zeros(len(T), dtype=np.int64),
+        gyroscope,
+        accelerometer,
+        magnetometer,
+        9.8,
+        np.zeros(3),
+        np.zeros((2, 401, 3)),
+    )
+    offset = np.array([0.5, 1.5, 2.5, 3.5]) + lag_s
+    grid = grid_of(readings, Knots(offset, np.arange(4), np.array([True, True, True])), lag_s)
+    return integrate(grid, np.r_[SCALE, ZERO], drift, np.r_[2.0 * SCALE, -ZERO], -1.0, 2.0)
+
+
+def test_a_force_that_grows_evenly_in_closed_form() -> None:
+    """Without turning: at the knots the force and its slope, over intervals its integral."""
+    force, jerk = np.array([1.0, -2.0, 3.0]), np.array([0.5, 0.25, -1.0])
+    at = np.array([0.5, 1.5, 2.5, 3.5])
+    still = np.tile(-ZERO / SCALE, (len(T), 1))
+    logged = (force + np.outer(T, jerk) + ZERO) / (2.0 * SCALE)
+    found = integrated(still, logged, None, np.zeros(3))
+    assert np.allclose(found.turned, np.eye(3))
+    assert np.allclose(found.force[1:3], (force + np.outer(at, jerk))[1:3])
+    assert np.allclose(found.jerk[1:3], jerk)
+    assert np.allclose(found.push, force + np.outer(0.5 * (at[1:] + at[:-1]), jerk))
+    assert not found.count.any()
+    assert not found.reading.any()
+
+
+def test_a_rate_that_grows_evenly_in_closed_form() -> None:
+    """About z, part of it the drift: rate ω at the knots and in the mean, the angle ∫ ω from the first knot on."""
+    first, slope, drift = 0.3, 0.2, 0.05
+    axis = np.array([0.0, 0.0, 1.0])
+    logged = (np.outer(first + slope * T, axis) - ZERO) / SCALE
+    magnetometer = np.where(((T > 1.6) & (T < 1.9) | (T > 2.6))[:, None], np.outer(T, [1.0, 2.0, 3.0]), np.nan)
+    found = integrated(logged, np.zeros((len(T), 3)), magnetometer, drift * axis)
+
+    def rate(t: Array) -> Array:
+        return first + slope * t + drift * (t - 2.0)
+
+    def angle(t: Array) -> Array:
+        """Since the first knot."""
+        return (first - 2.0 * drift) * (t - 0.5) + 0.5 * (slope + drift) * (t**2 - 0.25)
+
+    at = np.array([0.5, 1.5, 2.5, 3.5])
+    assert np.allclose(found.rate[1:3], np.outer(rate(at), axis)[1:3])
+    assert np.allclose(found.rate_change[1:3], (slope + drift) * axis)
+    assert np.allclose(found.rate_logged[1:3], ((np.outer(first + slope * at, axis) - ZERO) / SCALE)[1:3])
+    turned = Rotation.from_rotvec(np.outer(angle(at), axis)).as_matrix()
+    assert np.allclose(found.turned, turned, atol=1e-9)
+    # No reading in the first interval; of the others those that are there, but none after the last knot.
+    seen = [np.zeros(0), T[(T > 1.6) & (T < 1.9)], T[(T > 2.6) & (T < 3.5)]]
+    assert np.array_equal(found.count, [len(own) for own in seen])
+    for k, own in enumerate(seen[1:], 1):
+        assert np.allclose(found.reading[k], own.mean() * np.array([1.0, 2.0, 3.0]))
+        axes = Rotation.from_rotvec(np.outer(-angle(own), axis)).as_matrix().mean(axis=0)
+        assert np.allclose(found.axes[k], axes, atol=1e-9)
+        assert np.allclose(found.axes_rate[k], rate(own).mean() * axis)
+        # By the gyroscope's zero about z: the time since the interval's knot.
+        assert np.allclose(found.axes_by_gyroscope[k][2, 5], np.mean(own - at[k]))
+    assert not found.axes[0].any()

@@ -24,8 +24,11 @@ def known(h: Array, y: Array) -> Known:
     return Known(h.T @ h, h.T @ y)
 
 
-def all_at_once(observed: list[tuple[Array, Array]], days: Array, prior: Array) -> tuple[Array, Array]:
-    """States (k, D) at `days` and their covariances, by one least-squares problem; sessions are at DAY."""
+def all_at_once(
+    observed: list[tuple[Array, Array]], days: Array, prior: Array, jump: Array | None = None
+) -> tuple[Array, Array]:
+    """States (k, D) at `days` and their covariances, by one least-squares problem; sessions are at DAY, `jump` (M − 1,
+    D) is between them."""
     rows, right = [], []
     n = len(days) * D
     for k, day in enumerate(days):
@@ -39,8 +42,10 @@ def all_at_once(observed: list[tuple[Array, Array]], days: Array, prior: Array) 
         for i in range(D):
             block = np.zeros((1, n))
             block[0, k * D + i], block[0, (k + 1) * D + i] = -1.0, 1.0
-            sd = np.sqrt(WALK[i] * (days[k + 1] - days[k])) if WALK[i] else 1e-4
-            rows.append(block / sd)
+            variance = WALK[i] * (days[k + 1] - days[k])
+            if jump is not None:
+                variance += jump[list(DAY).index(days[k]), i]
+            rows.append(block / max(np.sqrt(variance), 1e-4))
             right.append(np.zeros(1))
     block = np.zeros((D, n))
     block[:, :D] = np.diag(np.sqrt(prior))
@@ -61,14 +66,25 @@ def chain(observed: list[tuple[Array, Array]], prior: Array | None = None) -> Ch
 @pytest.mark.parametrize("rows", [1, 2, 6])
 def test_every_session_and_any_day_is_what_least_squares_say(rows: int) -> None:
     """Sessions of one reading alone determine nothing by themselves."""
-    observed, prior = told(rows, rows), np.array([0.0, 0.0, 0.0, 0.2])
+    observed, prior = told(rows, rows), np.array([0.0, 0.2, 0.0, 0.0])
     found = chain(observed, prior)
-    days = np.sort(np.r_[DAY, 2.0, 5.5, 20.0])
+    days = np.sort(np.r_[-1.5, DAY, 2.0, 5.5, 20.0])
     state, covariance = all_at_once(observed, days, prior)
     for day, x, c in zip(days, state, covariance, strict=True):
         own = found.at(day).estimate()
         np.testing.assert_allclose(own.state, x, rtol=RTOL, atol=1e-7)
         np.testing.assert_allclose(own.covariance, c, rtol=RTOL, atol=1e-7)
+
+
+def test_sessions_may_be_further_apart_than_days_would_have_them() -> None:
+    observed, jump = told(8, 6), np.zeros((M - 1, D))
+    jump[1], jump[3, 2] = [0.5, 0.2, 0.0, 3.0], 2.0
+    found = Chain.of(DAY, [known(*own) for own in observed], WALK, jump, Known.nothing(D))
+    state, covariance = all_at_once(observed, DAY, np.zeros(D), jump)
+    for day, x, c in zip(DAY, state, covariance, strict=True):
+        own = found.at(day).estimate()
+        np.testing.assert_allclose(own.state, x, rtol=RTOL, atol=1e-6)
+        np.testing.assert_allclose(own.covariance, c, rtol=RTOL, atol=1e-6)
 
 
 def test_what_no_session_shows_stays_unknown_however_many_there_are() -> None:
@@ -80,8 +96,26 @@ def test_what_no_session_shows_stays_unknown_however_many_there_are() -> None:
     assert np.isinf(np.diagonal(own.covariance)[[0, 1, 2]]).all()
     assert np.isnan(own.state[[0, 1, 2]]).all()
     assert np.isfinite(own.covariance[3, 3])
+    assert not own.covariance[~np.eye(D, dtype=bool)].any()
     assert own.of(np.array([0.0, 0.0, 1.0, 0.0])) == (pytest.approx(np.nan, nan_ok=True), np.inf)
     assert np.isfinite(own.of(np.array([0.0, 0.0, 0.0, 2.0]))[1])
+
+
+@pytest.mark.parametrize(("left", "known_apart"), [(0.95e-9, False), (1.05e-9, True)])
+def test_two_that_are_told_apart_by_less_than_a_billionth_are_not(left: float, known_apart: bool) -> None:
+    units = np.array([1.0, 1e4])
+    information = np.array([[1.0, 1.0 - left], [1.0 - left, 1.0]]) * np.outer(units, units)
+    assert np.isfinite(Known(information, np.zeros(2)).estimate().state).all() == known_apart
+
+
+@pytest.mark.parametrize(("share", "told_third"), [(0.95e-3, True), (1.05e-3, False)])
+def test_what_has_next_to_no_part_in_what_is_unseen_is_known(share: float, told_third: bool) -> None:
+    """Two readings of three: what they leave open is (1, −1, 2 sin a), to the length of √2."""
+    a = share / np.sqrt(2.0)
+    read = np.array([[np.cos(a), np.cos(a), 0.0], [-np.sin(a), np.sin(a), 1.0]])
+    own = Known(read.T @ read, np.zeros(3)).estimate()
+    assert np.isnan(own.state[:2]).all()
+    assert np.isfinite(own.covariance[2, 2]) == told_third
 
 
 def test_others_are_all_but_the_session_itself() -> None:

@@ -4,8 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
-from fieldcal.estimation.pooled.strengths import Series, Strengths, innovations
+import fieldcal.estimation.pooled.strengths as module
+from fieldcal.estimation.pooled.strengths import (
+    FEW,
+    RISE,
+    Series,
+    Strengths,
+    beside_scatter,
+    innovations,
+    largest_likely,
+    of_pairs,
+    strengths_of,
+    unlikely,
+    usual_gap,
+)
 
 
 def test_innovations_are_those_of_a_kalman_filter_with_a_walk_and_a_slope() -> None:
@@ -41,3 +55,109 @@ def test_what_is_four_and_a_half_sd_off_starts_the_series_anew(off_sd: float, an
     else:
         assert z[1, 0] == pytest.approx(off_sd)
         assert s[2, 0] == pytest.approx(1.5)
+
+
+def test_of_nothing_nothing_is_known_to_move() -> None:
+    assert strengths_of(Series.of([])) == Strengths(0.0, 0.0, 0.0, FEW)
+    assert strengths_of(Series.of([np.zeros((0, 4))])) == Strengths(0.0, 0.0, 0.0, FEW)
+
+
+@pytest.mark.parametrize(("warmth", "range_degc"), [([-6.0, 0.0, 6.0], np.sqrt(24.0)), ([0.1, 0.2, 0.3], 1.0)])
+def test_of_single_sessions_the_slope_is_their_sd_over_the_temperatures_flown(
+    warmth: list[float], range_degc: float
+) -> None:
+    """Of three units, one session each, of which the median variance counts."""
+    rows = [np.array([[0.0, t, 7.0, v]]) for t, v in zip(warmth, (1.0, 4.0, 100.0), strict=True)]
+    series = Series.of(rows)
+    found = strengths_of(series)
+    assert (found.walk, found.scatter, found.freedom) == (0.0, 1.0, FEW)
+    assert found.slope == pytest.approx(4.0 / range_degc**2)
+    assert strengths_of(series, with_slope=False).slope == 0.0
+
+
+@pytest.mark.parametrize(
+    ("ratio", "expected"),
+    [
+        (0.25, 0.0),
+        (0.5, np.log(2.0)),
+        (25.0, np.log(100.0)),
+        (0.125, 4.0 * (1.0 - np.log(2.0))),
+        (0.025, 4.0 * (9.0 - np.log(10.0))),
+    ],
+)
+def test_a_variance_of_a_quarter_is_the_likeliest_and_less_the_unlikelier(ratio: float, expected: float) -> None:
+    """As four innovations of that variance would have it below, and above by an even chance for every magnitude."""
+    assert unlikely(ratio) == pytest.approx(expected)
+
+
+def test_the_largest_likely_strength_is_where_the_likelihood_has_fallen_by_half_a_standard_deviation() -> None:
+    best = np.array([1.0, -2.0])
+
+    def cost(x: np.ndarray) -> float:
+        return 5.0 + float((x[0] - 1.0) ** 2 + 4.0 * (x[1] + 2.0) ** 2)
+
+    for i, steep in ((0, 1.0), (1, 4.0)):
+        assert largest_likely(cost, best, 5.0, i) == pytest.approx(best[i] + np.sqrt(RISE / steep), abs=0.02)
+    np.testing.assert_array_equal(best, [1.0, -2.0])
+    # A likelihood that never falls so far tells nothing: the likeliest stays.
+    assert largest_likely(lambda x: 0.01 * x[0], best, 0.01, 0) == 1.0
+
+
+def test_the_usual_gap_is_the_median_of_days_between_sessions() -> None:
+    """Series of four, two and one session; two on the same day are not apart."""
+    day = np.array([[0.0, 5.0, 9.0], [2.0, 12.0, np.nan], [2.0, np.nan, np.nan], [6.0, np.nan, np.nan]])
+    assert usual_gap(day) == 4.0
+    assert usual_gap(day[:1]) == 1.0
+    assert usual_gap(np.array([[3.0], [3.0]])) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("strengths", "expected"),
+    [
+        (Strengths(0.0, 3.0, 0.0), 0.0),
+        (Strengths(0.25 * 3.0, 3.0, 0.0), 4.0 * np.log(2.0)),  # over four days as much as the scatter
+        (Strengths(0.0, 3.0, 3.0 / 36.0), 2.0 * np.log(2.0)),  # over 6 °C
+    ],
+)
+def test_a_walk_or_a_slope_as_large_as_the_scatter_is_that_unlikely(strengths: Strengths, expected: float) -> None:
+    assert beside_scatter(strengths, 4.0, 6.0) == pytest.approx(expected)
+
+
+def test_two_sessions_of_a_series_are_compared() -> None:
+    rng = np.random.default_rng(4)
+    rows = [np.column_stack([[0.0, 4.0], [0.0, 0.0], rng.normal(size=2), np.full(2, 0.01)]) for _ in range(30)]
+    found = strengths_of(Series.of(rows), with_slope=False)
+    assert 20.0 + FEW < found.freedom <= 30.0 + FEW
+    assert 0.4 < found.scatter < 2.0
+
+
+def test_another_start_and_a_nearer_end_find_the_same_strengths(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    rows = []
+    for _ in range(20):
+        day, warmth = np.cumsum(rng.uniform(1.0, 9.0, 12)), rng.uniform(-20.0, 10.0, 12)
+        value = 0.03 * rng.normal() * warmth + np.cumsum(0.1 * rng.normal(size=12)) + rng.normal(size=12)
+        rows.append(np.column_stack([day, warmth, value, np.full(12, 0.2)]))
+    plain = strengths_of(Series.of(rows))
+    for name, value in (
+        ("START", (0.3, 0.3, 0.3)),
+        ("TIMES", (1.2, 5.0, 20.0)),
+        ("TOLERANCES", {"fatol": 0.001, "xatol": 0.002}),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, value)
+            found = strengths_of(Series.of(rows))
+        for each in ("walk", "scatter", "slope"):
+            assert getattr(found, each) == pytest.approx(getattr(plain, each), rel=0.1), (name, each)
+
+
+def test_two_flights_of_a_session_differ_as_likely_as_a_normal_number() -> None:
+    """Of variance slope · ΔT² + v, over a number of a session's own sd; of one far off the density does not count."""
+    pairs = np.array([[7.0, 1.5, 0.3], [-3.0, -2.0, 0.5], [1.0, 0.2, 0.4]])
+    slope, own = 0.04, 1.7
+    sd = np.sqrt([0.04 * 49.0 + 0.3, 0.04 * 9.0 + 0.5, 0.04 + 0.4])
+    expected = -2.0 * np.sum(norm.logpdf(pairs[:, 1], scale=sd) - norm.logpdf(0.0, scale=np.sqrt(own)))
+    assert of_pairs(pairs, slope, own) == pytest.approx(expected)
+    far = np.vstack([pairs, [[1.0, 100.0, 0.4]]])
+    assert of_pairs(far, slope, own) == pytest.approx(expected + 4.5**2)
+    assert of_pairs(np.zeros((0, 3)), slope, own) == 0.0

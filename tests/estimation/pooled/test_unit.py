@@ -57,6 +57,7 @@ def test_a_step_of_ten_scatters_is_found_in_its_session_and_named() -> None:
         assert [(step.name, step.after) for step in found.steps] == [(NAMES[place], 7)]
         size = 10.0 * SCATTER[NAMES[place][:2]]
         assert abs(found.steps[0].size - size) < 5.0 * found.steps[0].sd
+        assert found.steps[0].z == pytest.approx(found.steps[0].size / found.steps[0].sd)
         assert not found.left_out
 
 
