@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import f as f_distribution
-from scipy.stats import t as t_distribution
 
 from fieldcal.estimation.normal_equations import Name, NormalEquations
 from fieldcal.estimation.pooled.chain import Chain, Estimate, Known
+from fieldcal.estimation.pooled.chance import log_beyond, log_beyond_either_way
 from fieldcal.estimation.pooled.strengths import Series, Strengths, strengths_of
 from fieldcal.geometry.rotation import Array
 
@@ -300,7 +299,7 @@ def _worst_flight(found: Pooled, freedom: Array) -> tuple[float, LeftOut] | None
     if not tested:
         return None
     chi2, count = (np.array([one[i] for one in tested]) for i in (1, 2))
-    chance = f_distribution.logsf(chi2 / count, count, float(np.median(freedom)))
+    chance = log_beyond(chi2 / count, count, float(np.median(freedom)))
     worst = int(np.argmin(chance))
     certain = chance[worst] < np.log(FALSE_ALARMS / len(flights))
     return (float(chance[worst]), LeftOut(*tested[worst])) if certain else None
@@ -341,7 +340,7 @@ def surest_step(found: Pooled, freedom: Array) -> tuple[float, Step] | None:
         of_state = jumps(past, chain.after[k] + chain.own[k])
         size[row], information[row] = (x[:p] for x in of_state)
     z = size * np.sqrt(information)
-    chance = np.log(2.0) + t_distribution.logsf(np.abs(z), freedom)
+    chance = log_beyond_either_way(z, freedom)
     row, i = (int(x) for x in np.unravel_index(int(np.argmin(chance)), chance.shape))
     if not chance[row, i] < np.log(FALSE_ALARMS / z.size):
         return None
@@ -357,7 +356,7 @@ def surest_drift(found: Pooled, freedom: Array) -> tuple[float, int] | None:
         return None
     length = float(found.unit.day[-1] - found.unit.day[0])
     chances = [
-        (float(np.log(2.0) + t_distribution.logsf(abs(rate.z), freedom[place])), place)
+        (float(log_beyond_either_way(rate.z, freedom[place])), place)
         for place, rate in enumerate(found.rates())
         if rate is not None and place not in found.drifting
         if abs(rate.per_day) * length > np.sqrt(found.scatter[place])

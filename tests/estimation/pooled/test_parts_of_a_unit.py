@@ -327,10 +327,10 @@ def test_of_a_constant_that_one_flight_of_a_session_does_not_see_there_is_no_dif
 
 @pytest.mark.parametrize(("after", "named"), [(1, False), (2, True), (4, True), (5, False)])
 def test_it_takes_two_sessions_on_either_side_of_a_step(after: int, named: bool) -> None:
-    found = surest_step(line(np.arange(6.0), 20.0 * (np.arange(6) >= after), 1.0), np.array([1e6]))
+    found = surest_step(line(np.arange(6.0), 100.0 * (np.arange(6) >= after), 1.0), np.array([1e6]))
     assert (found is not None and found[1].after == after) == named
     if found is not None and named:
-        assert found[1].size == pytest.approx(20.0, rel=1e-5)
+        assert found[1].size == pytest.approx(100.0, rel=1e-5)
         assert found[1].sd == pytest.approx(np.sqrt(1.0 / after + 1.0 / (6 - after)), rel=1e-5)
 
 
