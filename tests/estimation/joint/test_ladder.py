@@ -65,14 +65,16 @@ def test_every_motion_stands_on_the_first_rung_and_finds_what_is_off() -> None:
 
 
 def test_a_level_log_holds_the_accelerometer_and_tells_the_gyroscope() -> None:
-    r = simulate(seed=72, turned=(0.0, 0.0, 1.0), tremor_rad=0.02, dip_rad=np.radians(60.0), translation_rms_mps2=0.5)
-    results = physical(r)
+    level = {"turned": (0.0, 0.0, 1.0), "tremor_rad": 0.02, "dip_rad": np.radians(60.0), "translation_rms_mps2": 0.5}
+    results = physical(simulate(seed=72, peak_rad=(1.3, 1.5), **level))
     assert results["joint"].measured["rung"] == "held"
     assert set(rows_of(results, "accelerometer", "scale")["reason_code"]) == {"held_at_nominal"}
     assert set(rows_of(results, "accelerometer", "zero")["status"]) == {"refused"}
     yaw = rows_of(results, "gyroscope", "scale").filter(axis="z")
     assert yaw["status"][0] == "ok"
     assert abs(yaw["value"][0] - OFF["gyroscope"][2]) < 4.0 * yaw["sd"][0]
+    little = physical(simulate(seed=72, **level))  # its sd is 2.8 %, of 3 % beforehand
+    assert rows_of(little, "gyroscope", "scale").filter(axis="z")["reason_code"][0] == "scale_uncertain"
     # A zero needs no turning: it is published beside scales that are refused.
     zeros = rows_of(results, "gyroscope", "zero")
     assert set(zeros["status"]) == {"ok"}
