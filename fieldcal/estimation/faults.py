@@ -167,11 +167,14 @@ def _stuck(sensor: str, axis: str, t: Array, x: Array, beside: Array, unit: str)
     return Fault(sensor, axis, ReasonCode.STUCK, share, STUCK_SHARE, share > STUCK_SHARE, sentence)
 
 
-def _unbroken_starts(t: Array, x: Array) -> Array:
+def _unbroken_starts(t: Array, x: Array) -> np.ndarray:
     """Where runs of one value begin; none runs on through a pause: nobody knows what was there meanwhile."""
     interval = np.diff(t)
     pause = interval > max(STUCK_S, DROPOUT_INTERVALS * float(np.median(interval)))
-    return np.union1d(run_starts(x), np.flatnonzero(pause) + 1)
+    begins = np.zeros(len(x), dtype=bool)
+    begins[run_starts(x)] = True
+    begins[1:] |= pause
+    return np.flatnonzero(begins)
 
 
 def resolution(x: Array) -> float:

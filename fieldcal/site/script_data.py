@@ -9,7 +9,7 @@ import zlib
 from fieldcal.names import Json
 from fieldcal.words.printable import printable
 
-_LEVEL = 9
+_LEVEL = 4  # 9 makes it 6 % smaller in six times as long
 _ESCAPES = str.maketrans({"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "'": "\\u0027"})
 
 
