@@ -144,7 +144,7 @@ def _that_fits(path: str) -> str:
 
 def _applied(unit: UnitOnBoard) -> str:
     values = ", ".join(
-        f"{name} {value:.{0 if value.is_integer() else 6}{'f' if value.is_integer() else 'g'}}"
+        f"{name} {value:.0f}" if value.is_integer() else f"{name} {value:.6g}"
         for name, value in unit.parameters.items()
         if not name.endswith("_ID")
     )

@@ -20,7 +20,7 @@ def script(name: str, value: Json) -> bytes:
 
 def packed_script(name: str, value: Json) -> bytes:
     """The same of much data, compressed: a third of its size. The page unpacks it when its figures are drawn."""
-    text = base64.b64encode(zlib.compress(json.dumps(value, allow_nan=False, separators=(",", ":")).encode(), _LEVEL))
+    text = base64.b64encode(zlib.compress(_json(value).encode(), _LEVEL))
     return f'fieldcalPacked({_literal(name)},"{text.decode("ascii")}");\n'.encode("ascii")
 
 
@@ -30,4 +30,8 @@ def shown(text: str | None) -> str:
 
 
 def _literal(value: Json) -> str:
-    return json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":")).translate(_ESCAPES)
+    return _json(value).translate(_ESCAPES)
+
+
+def _json(value: Json) -> str:
+    return json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))

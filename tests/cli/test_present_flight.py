@@ -79,8 +79,9 @@ def test_residual_rows_without_scale_or_zero_make_no_table() -> None:
     """A flight at rest that tells the warm-up alone."""
     row = {"flight_id": "f", "unit_id": "u", "sensor": "accelerometer", "method": "attitude", "axis": "x"}
     found = row | {"status": "ok", "reason_code": None, "value": 1.0, "sd": 0.1, "unit": "1"}
-    rows: Any = [found | {"parameter": parameter} for parameter in ("residual_zero_per_degc", "zero_per_degc")]
+    rows: list[Any] = [found | {"parameter": parameter} for parameter in ("residual_zero_per_degc", "zero_per_degc")]
     assert residual_table(rows) is None
-    listed = residual_table([found | {"parameter": "residual_scale"}])  # type: ignore[list-item]
+    scale: Any = found | {"parameter": "residual_scale"}
+    listed = residual_table([scale])
     assert listed is not None
     assert len(listed.rows) == 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +56,8 @@ def pooled_table(root: Path, memory: Memory | None = None) -> pl.DataFrame:
     """The table `pooled` as the history has it now; nothing is written."""
     exchanged: Exchanges = {}
 
-    def units_of(vehicles: Sequence[str]) -> list[pl.DataFrame]:
+    @lru_cache(maxsize=1)  # a fleet of one group is read once
+    def units_of(vehicles: tuple[str, ...]) -> list[pl.DataFrame]:
         information, found = information_that_counts(root, vehicles)
         exchanged.update(found)
         return by_unit(information)
@@ -64,8 +65,9 @@ def pooled_table(root: Path, memory: Memory | None = None) -> pl.DataFrame:
     flown = Warehouse(root).scan("information").filter(counting(root)).select(FLOWN).unique().collect()
     telling = units_that_tell(flown, MOST_UNITS)
     where = set(flown.filter(pl.col("unit_id").is_in(telling))["vehicle_id"])
-    several = list(groups(root, ("information",), AT_ONCE))
-    known = {_id(unit): unit for group in several if where & set(group) for unit in units_of(group)}
+    several = [tuple(group) for group in groups(root, ("information",), AT_ONCE)]
+    asked = (unit for group in several if where & set(group) for unit in units_of(group))
+    known = {_id(unit): unit for unit in asked if _id(unit) in telling}
     units = (unit for group in several for unit in units_of(group))
     return told(_table([known[unit_id] for unit_id in telling], units, memory), exchanged, (Status.OK,))
 
