@@ -6,7 +6,7 @@
     python benchmarks/mutation.py --module exports --sample 40    # a room
 
 Needs the `test` extra and a system with fork. Nothing is written to the checkout: the changed module lives in the
-memory of a forked process. First a module's own tests (`TESTS` in `mutation_table.py`) run unchanged, and it is noted
+memory of a forked process. First a module's own tests (`TESTS` in `mutation_table`) run unchanged, and it is noted
 which of them pass through which line; a change is then shown to the tests of its line, the quickest first, until one
 fails. Tests are collected once a module, and functions get the changed code in a copy of that process: a fraction of a
 second a change. What runs at import (constants, defaults) is imported anew: some seconds.
