@@ -86,6 +86,7 @@ class FlightWork:
         self._vehicle = vehicle
         self._settings: FlightSettings | None = None
         self._inputs: dict[str, str] = {}
+        self._made_of: dict[str, Causes] = {}
         self._tables = StageTables(root, job.vehicle_id, job.flight_id, self.records, table, self._read_again)
 
     def usable(self) -> bool:
@@ -107,8 +108,7 @@ class FlightWork:
 
     def key(self, step: str) -> str:
         """run_key of a step; the records of the steps before it must be known."""
-        stage, _ = stage_and_unit(step)
-        return run_key(stage, sources()[stage], self._params(step), self._hashes(step))
+        return self._causes(step)["run_key"]
 
     def do(self, step: str) -> None:
         """Take a step's result from the cache, or run it."""
@@ -168,6 +168,7 @@ class FlightWork:
 
     def _take(self, step: str, record: Record) -> None:
         self.records[step] = record
+        self._made_of.clear()  # what follows may read from it
         stage, _ = stage_and_unit(step)
         if step != INGEST:
             self._inputs |= {f"{stage}.{table}": output["sha256"] for table, output in record["outputs"].items()}
@@ -195,13 +196,17 @@ class FlightWork:
 
     def _causes(self, step: str) -> Causes:
         """What the key of a step is made of, as its record keeps it."""
-        return {
-            "run_key": self.key(step),
-            "params": plain(self._params(step)),
-            "inputs": self._hashes(step),
-            "source": sources()[stage_and_unit(step)[0]],
-            "versions": versions(),
-        }
+        if step not in self._made_of:
+            stage, params, inputs = stage_and_unit(step)[0], self._params(step), self._hashes(step)
+            source = sources()[stage]
+            self._made_of[step] = {
+                "run_key": run_key(stage, source, params, inputs),
+                "params": plain(params),
+                "inputs": inputs,
+                "source": source,
+                "versions": versions(),
+            }
+        return self._made_of[step]
 
     # --- ingest
 

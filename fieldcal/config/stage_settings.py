@@ -7,7 +7,7 @@ again for nothing. Meaning and limits of the parameters stand in `fieldcal.confi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from typing import TypeVar, cast
 
 from pydantic import TypeAdapter, ValidationError
@@ -348,7 +348,7 @@ def taken_from(flight: FlightSettings, kind: type[S]) -> S:
 
 def as_json(settings: StageSettings) -> dict[str, Json]:
     """A stage's settings as plain JSON, as they enter its run key and its record."""
-    return {name: _json(value) for name, value in asdict(settings).items()}
+    return {field.name: _json(getattr(settings, field.name)) for field in fields(settings)}
 
 
 def from_json(plain: Mapping[str, object], kind: type[S]) -> S | None:
@@ -364,4 +364,6 @@ def _json(value: object) -> Json:
         return {str(key): _json(item) for key, item in value.items()}
     if isinstance(value, tuple):
         return [_json(item) for item in value]
+    if is_dataclass(value):
+        return {field.name: _json(getattr(value, field.name)) for field in fields(value)}
     return str(value) if isinstance(value, str) else cast("float | None", value)

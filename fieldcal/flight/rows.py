@@ -23,7 +23,7 @@ from fieldcal.stages.composition import PUBLISHED_ROWS
 from fieldcal.stages.pipeline import PUBLISHED
 from fieldcal.stages.preparation import TURNED_DEG
 from fieldcal.stages.stage import stage_and_unit
-from fieldcal.warehouse.store import empty_frame, frame
+from fieldcal.warehouse.store import empty_frame
 from fieldcal.words.flights import is_consequence, no_result
 
 COMPOSITION, MANOEUVRE = "composition", "manoeuvre"
@@ -192,7 +192,7 @@ def unit_lead(leading: FlightLead, unit: Unit) -> UnitLead:
 
 def rows_frame(table: str, rows: Sequence[Mapping[str, object]]) -> pl.DataFrame:
     """Rows as a typed frame of `table`."""
-    empty = frame(schemas.arrow_schema(table).empty_table())
+    empty = empty_frame(table)
     return pl.DataFrame(rows, schema=empty.schema, strict=False) if rows else empty
 
 

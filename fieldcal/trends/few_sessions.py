@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from fieldcal.geometry.rotation import Array
 from fieldcal.schemas.reference import ENOUGH_SESSIONS, REFERENCE_DEGC
@@ -110,7 +110,7 @@ def _with(lent: Lent, h: Histories, flights: np.ndarray) -> tuple[float, ...] | 
     left = y - lent.slope * dt
     value, variance, squares = _mean(v, left)
     alone = _mean(v - lent.slope_sd**2 * np.outer(dt, dt), left)[2]
-    if stats.chi2.sf(squares, len(y) - 1) < CONTRADICTION or stats.chi2.sf(alone, len(y) - 1) < STEP:
+    if special.chdtrc(len(y) - 1, squares) < CONTRADICTION or special.chdtrc(len(y) - 1, alone) < STEP:
         return None
     last = session == session[-1]
     earlier, earlier_variance, weights = _mean_with_weights(v[np.ix_(~last, ~last)], left[~last])

@@ -10,7 +10,7 @@ in 6 of 20 fleets, 16 in 11, 20 in 19; a drift of half an sd a session is seen f
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
+from scipy.special import ndtri
 
 from fieldcal.geometry.rotation import Array
 from fieldcal.schemas.reference import ENOUGH_SESSIONS
@@ -43,4 +43,4 @@ def until_step_or_drift(n_sessions: int | None) -> int:
 
 
 def _sigmas(p: Array) -> Array:
-    return np.asarray(stats.norm.isf(0.5 * p))
+    return -np.asarray(ndtri(0.5 * p))

@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import DriftStatus
@@ -100,7 +100,7 @@ def judge(e: Evidence, kind: np.ndarray | None = None) -> Trends:
         session = np.where(e.enough, np.maximum(moderated - claimed, 0.0), session)
         freedom = np.where(e.enough, lent, freedom)
     wider = np.sqrt(ratio)
-    drift_p = 2.0 * stats.t.sf(np.abs(chosen["drift_z"] / wider), np.maximum(freedom, LEAST_FREEDOM))
+    drift_p = 2.0 * special.stdtr(np.maximum(freedom, LEAST_FREEDOM), -np.abs(chosen["drift_z"] / wider))
     v = e.last_variance + session + flight
     line = chosen["last_line"] * ratio
     spread = np.where(e.last_kept, np.maximum(v - line, LEAST_LEFT * v), v + line)
@@ -172,10 +172,12 @@ def statuses(trends: Trends, fleet_p: Array) -> np.ndarray:
 
 def alarms(p_value: Array, rate: float = FALSE_ALARMS) -> np.ndarray:
     """Which of these p-values stand out when at most `rate` of those named may be false (Benjamini and Hochberg)."""
+    from scipy.stats import false_discovery_control
+
     p = np.where(np.isfinite(p_value), p_value, 1.0)
     if len(p) == 0:
         return np.zeros(0, dtype=bool)
-    return np.asarray(stats.false_discovery_control(p) <= rate)
+    return np.asarray(false_discovery_control(p) <= rate)
 
 
 def pooled(h: Histories) -> tuple[Array, Array]:

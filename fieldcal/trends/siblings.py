@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from fieldcal.estimation.segments import run_starts
 from fieldcal.geometry.rotation import Array
@@ -69,7 +69,7 @@ def sibling_distance(
             if judged.any():
                 t, left = _distances(value[members], sd[members], inside[members], lent, others)
                 z[members] = np.where(judged, t, np.nan)
-                p[members] = np.where(judged, 2.0 * stats.t.sf(np.abs(t), left), 1.0)
+                p[members] = np.where(judged, 2.0 * special.stdtr(left, -np.abs(t)), 1.0)
     return z, p
 
 
@@ -91,7 +91,7 @@ def outliers(value: Array, sd: Array, level: float) -> np.ndarray:
         if int(inside.sum()) - 1 < ENOUGH_SIBLINGS:
             break
         taken.append(i)
-        if int(inside.sum()) * 2.0 * float(stats.t.sf(abs(t[i]), freedom[i])) <= level:
+        if int(inside.sum()) * 2.0 * float(special.stdtr(freedom[i], -abs(t[i]))) <= level:
             last = len(taken)
         inside[i] = False
     result = np.zeros(len(value), dtype=bool)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from fieldcal.geometry.rotation import Array
 from fieldcal.schemas.reference import REFERENCE_DEGC
@@ -113,7 +113,7 @@ def combined(warm: tuple[Array, Array] | None, sessions: tuple[Array, Array] | N
     if len(sources) == 2:
         (a, n_a), (b, n_b) = sources
         squares = together(np.stack([a, b]), np.stack([n_a, n_b]))[2]
-        agrees = bool(stats.chi2.sf(squares, ORDER) >= CONTRADICTION)
+        agrees = bool(special.chdtrc(ORDER, squares) >= CONTRADICTION)
         if not agrees:
             sources = sources[1:]
     c, information, _, _ = together(np.stack([s[0] for s in sources]), np.stack([s[1] for s in sources]))

@@ -130,7 +130,7 @@ def _sql_type(field: pa.Field) -> str:
     """DuckDB's type of a column of a table."""
     import duckdb
 
-    (kind,) = duckdb.from_arrow(pa.schema([field]).empty_table()).types
+    (kind,) = duckdb.from_arrow(pa.Table.from_batches([], pa.schema([field]))).types
     return str(kind)
 
 

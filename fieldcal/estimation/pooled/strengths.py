@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import brentq, minimize
 
+from fieldcal.compiled import LIBRARY
+from fieldcal.compiled import series as compiled
 from fieldcal.geometry.rotation import Array
 
 RESTART_SD = 4.5
@@ -77,6 +79,9 @@ class Series:
 def innovations(series: Series, strengths: Strengths) -> tuple[Array, Array]:
     """One-step prediction errors over their sd and the variances, (m, n); NaN where there are none: at the first
     session of each series, and where it starts anew."""
+    if LIBRARY is not None:
+        variances = strengths.walk, strengths.scatter, strengths.slope, RESTART_SD**2
+        return compiled.innovations(LIBRARY, series.day, series.warmth_degc, series.value, series.variance, variances)
     count, width = series.value.shape
     z, variance = np.full((2, count, width), np.nan)
     c, slope = np.zeros((2, width))
@@ -86,7 +91,7 @@ def innovations(series: Series, strengths: Strengths) -> tuple[Array, Array]:
         day, t, y = series.day[k], series.warmth_degc[k], series.value[k]
         here = np.isfinite(y)
         r = series.variance[k] + strengths.scatter
-        of_c = of_c + strengths.walk * np.where(started, day - last, 0.0)
+        of_c = of_c + strengths.walk * np.where(started & here, day - last, 0.0)
         s = of_c + 2.0 * t * p_cs + t**2 * p_ss + r
         error = y - c - slope * t
         usual = here & started & (error**2 < RESTART_SD**2 * s)

@@ -15,7 +15,7 @@ from datetime import datetime
 
 import numpy as np
 import polars as pl
-from scipy import stats
+from scipy import special
 
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import JOINT_METHODS, DriftStatus, Method, Status
@@ -168,7 +168,7 @@ def _told(
 
 def _columns(row: PooledRow) -> Columns:
     slope, slope_sd = _number(row["slope_per_day"]), _number(row["slope_per_day_sd"])
-    chance = 2.0 * stats.t.sf(abs(slope / slope_sd), row["n_innovations"]) if slope_sd > 0.0 else np.nan
+    chance = 2.0 * special.stdtr(row["n_innovations"], -abs(slope / slope_sd)) if slope_sd > 0.0 else np.nan
     return {
         "n_flights": row["n_flights"],
         "n_sessions": row["n_sessions"],

@@ -44,6 +44,19 @@ def test_innovations_are_those_of_a_kalman_filter_with_a_walk_and_a_slope() -> N
         state, p = state + gain * error, p - np.outer(gain, gain) * expected
 
 
+@pytest.mark.parametrize("by_numpy", [False, True])
+def test_over_a_session_that_says_nothing_a_constant_walks_once(
+    by_numpy: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if by_numpy:
+        monkeypatch.setattr(module, "LIBRARY", None)
+    day, none = np.array([[0.0], [3.0], [7.0]]), np.array([[1.0], [np.nan], [2.0]])
+    z, s = innovations(Series(day, np.zeros((3, 1)), none, np.ones((3, 1))), Strengths(0.5, 0.25, 0.0))
+    assert np.isnan(z[:2]).all()
+    assert s[2, 0] == pytest.approx(1.25 + 0.5 * 7.0 + 1.25)
+    assert z[2, 0] == pytest.approx(1.0 / np.sqrt(s[2, 0]))
+
+
 @pytest.mark.parametrize(("off_sd", "anew"), [(4.4, False), (4.6, True), (-4.4, False), (-4.6, True)])
 def test_what_is_four_and_a_half_sd_off_starts_the_series_anew(off_sd: float, anew: bool) -> None:
     value = np.array([1.0, 1.0 + off_sd * np.sqrt(2.0), 1.0 + off_sd * np.sqrt(2.0)])
