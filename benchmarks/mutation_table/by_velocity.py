@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from mutation_table.reasons import ANY_NEGATIVE, CONVERGED, DOWN, GUARD, NEVER_MET, SAME_AT_THE_EDGE, SETTLED, START
+from mutation_table.reasons import (
+    ANY_NEGATIVE,
+    CONVERGED,
+    DOWN,
+    GUARD,
+    NEVER_MET,
+    SAME_AT_THE_EDGE,
+    SAME_MINUS,
+    SETTLED,
+    START,
+)
 
 EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("estimation.by_velocity.equations", "solve", "flat = one.theta.reshape(-1, p)", "1 → 2"): ANY_NEGATIVE,
@@ -58,26 +68,38 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("estimation.by_velocity.problem", "place_knots", "if apart < FASTEST_EPOCHS_S:", "< → <="): NEVER_MET,
     (
         "estimation.by_velocity.start",
-        "",
-        "VELOCITY_SD_MPS, FIELD_SD, WINDOW_S, WINDOW_WITHOUT_FIELD_S = 0.2, 0.1, 4.0, 10.0",
-        "0.2 → 0.22000000000000003",
-    ): START,
+        "attitudes",
+        "attitude = (left * sign[:, None, :]) @ right @ path.turned",
+        "* → /",
+    ): SAME_MINUS,
     (
-        "estimation.by_velocity.start",
-        "",
-        "VELOCITY_SD_MPS, FIELD_SD, WINDOW_S, WINDOW_WITHOUT_FIELD_S = 0.2, 0.1, 4.0, 10.0",
-        "0.1 → 0.11000000000000001",
-    ): START,
+        "estimation.by_velocity.equations",
+        "solve",
+        "drawn[:, r, 1 + group] = np.sqrt(w[:, r]) * sign[:, r]",
+        "* → /",
+    ): SAME_MINUS,
     (
-        "estimation.by_velocity.start",
-        "",
-        "VELOCITY_SD_MPS, FIELD_SD, WINDOW_S, WINDOW_WITHOUT_FIELD_S = 0.2, 0.1, 4.0, 10.0",
-        "4.0 → 4.4",
-    ): START,
+        "estimation.by_velocity.equations",
+        "noise_in_readings",
+        "out[first : first + 3] = of_readings * np.where(share < len(jump), share, 0.0) / state.values[name][:3]",
+        "< → <=",
+    ): NEVER_MET,
     (
-        "estimation.by_velocity.start",
-        "",
-        "VELOCITY_SD_MPS, FIELD_SD, WINDOW_S, WINDOW_WITHOUT_FIELD_S = 0.2, 0.1, 4.0, 10.0",
-        "10.0 → 11.0",
-    ): START,
+        "estimation.by_velocity.equations",
+        "solve",
+        "scale = 1.0 / np.sqrt(np.maximum(np.diagonal(total), 1e-300))",
+        "1.0 → 1.1",
+    ): "a scale near that of the constants, for the digits alone",
+    (
+        "estimation.by_velocity.equations",
+        "solve",
+        "scale = 1.0 / np.sqrt(np.maximum(np.diagonal(total), 1e-300))",
+        "1e-300 → 1.1000000000000002e-300",
+    ): GUARD,
+    (
+        "estimation.by_velocity.strapdown",
+        "integrate.total",
+        "np.cumsum((x[1:] + x[:-1]) * half.reshape(-1, *[1] * (x.ndim - 1)), axis=0, out=out[1:])",
+        "1 → 2 #3",
+    ): ANY_NEGATIVE,
 }

@@ -109,10 +109,8 @@ def _links(
     theta[:, :3, gyroscope] = -turned
     theta[:, 3:, gyroscope] = -frame[joined] @ path.push_by_gyroscope[joined] - 0.5 * cross @ turned
     theta[:, 3:, layout["accelerometer"]] = -frame[joined] @ path.push_by_accelerometer[joined]
-    variance = np.empty((m, 6))
-    variance[:, :3] = (levels.turn * interval)[:, None]
     within = levels.turn * interval * np.sum(push**2, axis=1) / 12.0
-    variance[:, 3:] = (levels.push * interval + within)[:, None]
+    variance = np.repeat(np.column_stack([levels.turn * interval, levels.push * interval + within]), 3, axis=1)
     return Rows(np.hstack([jump, kick]), here, there, theta, joined, variance, (*[TURN] * 3, *[PUSH] * 3))
 
 
@@ -192,7 +190,7 @@ def noise_in_readings(
     seconds is in the velocity's walk, and in no reading."""
     out = np.zeros(links.theta.shape[2])
     back = body_from_inertial(state.q[links.knot])
-    triads = (("gyroscope", slice(0, 3), turn_share), ("accelerometer", slice(3, 6), push_share))
+    triads = (("gyroscope", slice(None, 3), turn_share), ("accelerometer", slice(3, None), push_share))
     for name, rows, of_readings in triads:
         jump = np.einsum("nij,nj->ni", back, links.residual[:, rows])
         share = np.sum(jump**2 / links.variance[:, rows], axis=0)

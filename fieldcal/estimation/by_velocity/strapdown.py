@@ -11,14 +11,7 @@ import numpy as np
 
 from fieldcal.estimation.by_velocity.problem import Knots
 from fieldcal.estimation.joint.problem import Readings
-from fieldcal.geometry.rotation import (
-    Array,
-    body_from_inertial,
-    cumulative_product,
-    from_rotation_vector,
-    rotation_steps,
-    skew,
-)
+from fieldcal.geometry.rotation import IDENTITY, Array, body_from_inertial, propagate, skew
 
 NEAR_S = 0.03  # on either side of an epoch: rate and acceleration there are means over this
 
@@ -57,15 +50,11 @@ def grid_of(readings: Readings, knots: Knots, lag_s: float) -> Grid:
         columns = [np.interp(t[order], readings.t[known], column) for column in x[known].T]
         both.append(np.column_stack(columns))
     logged = readings.magnetometer
-    field: Array = np.zeros((0, 3))
-    if logged is None:
-        seen = np.zeros(0, dtype=np.int64)
-    else:
-        valid = np.flatnonzero(np.isfinite(logged[samples]).all(axis=1))
-        seen, field = place[valid], logged[samples[valid]]
-    knot = place[len(samples) :]
+    field = np.full((len(samples), 3), np.nan) if logged is None else logged[samples]
+    valid = np.isfinite(field).all(axis=1)
+    seen, knot = place[: len(samples)][valid], place[len(samples) :]
     interval = np.searchsorted(knot, seen, side="right") - 1
-    return Grid(t[order], both[0], both[1], knot, seen, field, interval)
+    return Grid(t[order], both[0], both[1], knot, seen, field[valid], interval)
 
 
 @dataclass(frozen=True)
@@ -110,8 +99,7 @@ def integrate(
     since_middle = (grid.t - middle_s)[:, None]
     rate = grid.gyroscope * gyroscope[:3] + gyroscope[3:] + drift * since_middle
     force = -gravity_sign * (grid.accelerometer * accelerometer[:3] + accelerometer[3:])
-    q = cumulative_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], from_rotation_vector(rotation_steps(grid.t, rate))]))
-    turned = body_from_inertial(q).transpose(0, 2, 1)
+    turned = body_from_inertial(propagate(grid.t, rate, IDENTITY)).transpose(0, 2, 1)
     in_frame = np.einsum("nij,nj->ni", turned, force)
     half = 0.5 * np.diff(grid.t)
 
@@ -141,10 +129,10 @@ def integrate(
     return Integrated(
         turned=turned[knot],
         rate=_slope(grid.t, angle, at),
-        rate_change=(_slope(grid.t, angle, at + NEAR_S) - _slope(grid.t, angle, at - NEAR_S)) / (2.0 * NEAR_S),
+        rate_change=_bend(grid.t, angle, at),
         rate_logged=_slope(grid.t, total(grid.gyroscope), at),
         force=_slope(grid.t, moved, at),
-        jerk=(_slope(grid.t, moved, at + NEAR_S) - _slope(grid.t, moved, at - NEAR_S)) / (2.0 * NEAR_S),
+        jerk=_bend(grid.t, moved, at),
         push=push,
         turn_by_gyroscope=np.diff(by_gyroscope[knot], axis=0),
         push_by_gyroscope=by_push,
@@ -159,7 +147,13 @@ def integrate(
 
 def _slope(t: Array, x: Array, at: Array) -> Array:
     """Mean slope of x (N, 3) over NEAR_S on either side of `at` (K,), within the samples."""
-    middle = np.clip(at, t[0] + 0.1 * NEAR_S, t[-1] - 0.1 * NEAR_S)
-    low, high = np.maximum(middle - NEAR_S, t[0]), np.minimum(middle + NEAR_S, t[-1])
+    low, high = np.maximum(at - NEAR_S, t[0]), np.minimum(at + NEAR_S, t[-1])
     change = np.column_stack([np.interp(high, t, c) - np.interp(low, t, c) for c in x.T])
     return np.asarray(change / (high - low)[:, None])
+
+
+def _bend(t: Array, x: Array, at: Array) -> Array:
+    """Change of the mean slope of x (N, 3) from NEAR_S before `at` (K,) to NEAR_S after it, a second; at the ends of
+    the record that of the nearest place with so much on either side."""
+    inner = np.clip(at, t[0] + 2.0 * NEAR_S, t[-1] - 2.0 * NEAR_S)
+    return (_slope(t, x, inner + NEAR_S) - _slope(t, x, inner - NEAR_S)) / (2.0 * NEAR_S)

@@ -131,11 +131,12 @@ def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_
     expected = EXPECTED_SHARE**2 * own
     if (known.sum(axis=0) < 2).all():
         return Strengths(0.0, expected, own / range_degc**2 if with_slope else 0.0, FEW)
-    units = np.array([own / gap_day, own, own / range_degc**2])
+    size = 3 if with_slope else 2
+    units = np.array([own / gap_day, own, own / range_degc**2])[:size]
 
     def given(x: Array) -> Strengths:
-        walk, scatter, slope = units * np.exp(np.clip(np.r_[x, -np.inf][:3], *LIMITS))
-        return Strengths(float(walk), float(scatter), float(slope) if with_slope else 0.0)
+        walk, scatter, *slope = map(float, units * np.exp(np.clip(x, *LIMITS)))
+        return Strengths(walk, scatter, slope[0] if slope else 0.0)
 
     def cost(x: Array) -> float:
         strengths = given(x)
@@ -149,7 +150,6 @@ def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_
         outside = np.sum(np.maximum(np.abs(x) - LIMITS[1], 0.0) ** 2)
         return float(likelihood + few + outside)
 
-    size = 3 if with_slope else 2
     start = min((np.log(np.square(at[:size])) for at in _starts(with_slope)), key=cost)
     simplex = start + np.eye(size + 1, size, -1)
     best = minimize(cost, start, method="Nelder-Mead", options={**TOLERANCES, "initial_simplex": simplex})

@@ -165,10 +165,10 @@ class Pooled:
         before, after = others.estimate(), (others + own).estimate()
         p = len(self.names)
         variance = np.diagonal(before.covariance)[:p]
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore", divide="ignore"):
             gained = variance - np.diagonal(after.covariance)[:p]
             known = np.isfinite(gained) & (gained > LEAST_SHARE * variance)
-            return np.where(known, (after.state - before.state)[:p] / np.sqrt(np.where(known, gained, 1.0)), np.nan)
+            return np.where(known, (after.state - before.state)[:p] / np.sqrt(gained), np.nan)
 
     def _nothing(self) -> Known:
         return Known.nothing(len(self.scatter))

@@ -72,16 +72,33 @@ def test_a_step_is_that_of_dense_least_squares(seed: int) -> None:
     assert np.allclose(np.concatenate(each).sum(axis=0), gradient, rtol=1e-7, atol=1e-7)
 
 
+def test_the_constants_units_do_not_matter() -> None:
+    """In units a million times as large, and as small, the same step, covariance and probes."""
+    rng = np.random.default_rng(6)
+    rows = drawn_rows(rng, KNOTS, P)
+    weight, signs = ([draw(one.residual.shape) for one in rows] for draw in (np.ones, np.ones))
+    prior, pulled, nothing = np.diag(rng.uniform(0.1, 1.0, P)), rng.normal(size=P), np.zeros(P)
+    unit = 10.0 ** np.linspace(-8.0, 8.0, P)
+    plain = solve(rows, weight, KNOTS, (prior, pulled), nothing, signs)
+    for one in rows:
+        one.theta[:] *= unit
+    found = solve(rows, weight, KNOTS, (prior * np.outer(unit, unit), pulled * unit), nothing, signs)
+    np.testing.assert_allclose(found.theta * unit, plain.theta, rtol=1e-9)
+    np.testing.assert_allclose(found.covariance * np.outer(unit, unit), plain.covariance, rtol=1e-9, atol=1e-12)
+    assert found.probes[0].shape == (P, len(GROUPS))
+    np.testing.assert_allclose(found.probes[1], plain.probes[1], atol=1e-9)
+
+
 def test_noise_of_readings_is_counted_for_its_own_triad_and_not_where_jumps_are_the_starts_errors() -> None:
     rng = np.random.default_rng(5)
     n = 40
     q = normalise(rng.normal(size=(n + 1, 4)))
-    jump = rng.normal(size=(n, 6)) * [0.5, 0.6, 3.0, 0.4, 0.7, 0.8]
+    variance = np.array([1.0, 0.8, 0.9, 1.1, 1.2, 1.3]) * np.ones((n, 6))
+    jump = np.sqrt(variance) * rng.normal(size=(n, 6)) * [0.5, 0.6, 3.0, 0.4, 0.7, 0.8]
     axes = body_from_inertial(q[:n])
     turned = np.concatenate(
         [np.einsum("nji,nj->ni", axes, jump[:, part]) for part in (slice(0, 3), slice(3, 6))], axis=1
     )
-    variance = np.ones((n, 6))
     nothing = np.zeros((n, 6, STATES))
     links = Rows(turned, nothing, nothing, np.zeros((n, 6, 14)), np.arange(n), variance, (TURN,) * 3 + (PUSH,) * 3)
     values = {
@@ -92,7 +109,7 @@ def test_noise_of_readings_is_counted_for_its_own_triad_and_not_where_jumps_are_
     layout = {"gyroscope": slice(1, 7), "accelerometer": slice(8, 14)}
     found = noise_in_readings(links, state, layout, 0.25, 0.5)
     expected = np.zeros(14)
-    squares = np.sum(jump**2, axis=0)
+    squares = np.sum(jump**2 / variance, axis=0)
     expected[1:4] = 0.25 * squares[:3] / values["gyroscope"][:3]
     expected[3] = 0.0  # larger than its noise
     expected[8:11] = 0.5 * squares[3:] / values["accelerometer"][:3]

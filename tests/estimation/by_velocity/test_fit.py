@@ -15,6 +15,7 @@ from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.by_velocity.fit import FEWEST_EPOCHS
 from fieldcal.estimation.by_velocity.information import observed
 from fieldcal.estimation.by_velocity.problem import place_knots
+from fieldcal.estimation.by_velocity.walk import walk_density
 from fieldcal.geometry.rotation import angle_between
 
 RATE_HZ = 200.0
@@ -162,6 +163,33 @@ def test_another_way_down_ends_at_the_same_minimum(monkeypatch: pytest.MonkeyPat
                 assert np.allclose(sd, plain[name][1], rtol=0.05)
 
 
+@pytest.mark.parametrize("still", [False, True])
+def test_no_walk_is_less_than_its_triads_noise_makes_and_no_receiver_better_than_it_is_rounded(
+    monkeypatch: pytest.MonkeyPatch, still: bool
+) -> None:
+    """Of readings that do not change at all a walk is 1e-10 rad²/s and 1e-8 (m/s)²/s."""
+    flight = short_flight("lively", 7)
+    readings = readings_of(flight)
+    if still:
+        readings = replace(
+            readings,
+            gyroscope=np.zeros((len(flight.t), 3)),
+            accelerometer=np.tile([0.0, 0.0, flight.experiment.gravity_mps2], (len(flight.t), 1)),
+        )
+    seen = []
+
+    def told(*arguments: object) -> None:
+        seen.append(arguments[1])
+        raise RuntimeError
+
+    monkeypatch.setattr(by_velocity, "renewed", told)
+    with pytest.raises(RuntimeError):
+        fitted(flight, readings)
+    walks = [walk_density(readings, x, np.ones(3)) for x in (readings.gyroscope, readings.accelerometer)]
+    rounded = (0.02 / np.median(flight.gnss_sd)) ** 2
+    np.testing.assert_allclose(seen[0], [*([1e-10, 1e-8] if still else walks), rounded, rounded, 0.0], rtol=1e-12)
+
+
 def test_attitude_is_that_of_the_flight() -> None:
     flight = short_flight("mission", 8)
     fit = fitted(flight)
@@ -228,15 +256,16 @@ def test_it_takes_fifty_epochs_among_the_readings(epochs: int, taken: bool) -> N
             fitted(short)
 
 
-def test_a_magnetometer_of_nineteen_readings_is_left_out() -> None:
-    flight = short_flight("lively", 7)
+@pytest.mark.parametrize(("readings", "taken"), [(19, False), (20, True)])
+def test_a_magnetometer_takes_part_with_twenty_readings(readings: int, taken: bool) -> None:
+    flight = short_flight("lively", 11)
     few = np.full((len(flight.t), 3), np.nan)
-    at = np.linspace(200, len(flight.t) - 200, 19).astype(int)
+    at = np.linspace(200, len(flight.t) - 200, readings).astype(int)
     few[at] = flight.counts["magnetometer"][at]
     fit = fitted(flight, with_readings(flight, magnetometer=few))
-    assert "magnetometer" not in fit.layout
-    assert not fit.setting.lit.any()
-    assert fit.field_weight == 1.0
+    assert ("magnetometer" in fit.layout) == taken
+    assert fit.setting.lit.sum() == (readings if taken else 0)
+    assert taken or fit.field_weight == 1.0
 
 
 def test_hover_tells_no_scale_of_an_accelerometer() -> None:

@@ -116,7 +116,41 @@ def test_a_force_that_grows_evenly_in_closed_form() -> None:
     assert np.allclose(found.jerk[1:3], jerk)
     assert np.allclose(found.push, force + np.outer(0.5 * (at[1:] + at[:-1]), jerk))
     assert not found.count.any()
+    assert found.reading.shape == (3, 3)
     assert not found.reading.any()
+
+
+def test_at_the_ends_of_the_record_means_are_of_what_there_is() -> None:
+    """At the first and last knot: the force of the 0.03 s there, its slope 0.06 s further in."""
+    t = np.arange(2001) / 1000.0
+    first, jerk, snap = np.ones(3), np.array([0.5, 0.25, -1.0]), np.array([3.0, -2.0, 1.0])
+    force = first + np.outer(t, jerk) + np.outer(t**2, 0.5 * snap)
+    still, no_turns = np.zeros((len(t), 3)), np.zeros((2, len(t), 3))
+    readings = Readings(t, np.zeros(len(t), dtype=np.int64), still, force, None, 9.8, np.zeros(3), no_turns)
+    offset = np.array([0.5, 1.0, 1.5])
+    grid = grid_of(readings, Knots(offset, np.arange(3), np.ones(2, dtype=bool)), 0.0)
+    assert grid.magnetometer.shape == (0, 3)
+    found = integrate(grid, UNIT, np.zeros(3), UNIT, -1.0, 1.0)
+    a, b = np.maximum(offset - 0.03, 0.5), np.minimum(offset + 0.03, 1.5)
+    mean = first + np.outer(0.5 * (a + b), jerk) + np.outer((b**3 - a**3) / (b - a), snap) / 6.0
+    np.testing.assert_allclose(found.force, mean, atol=1e-5)
+    np.testing.assert_allclose(found.jerk, jerk + np.outer([0.56, 1.0, 1.44], snap), atol=1e-3)
+
+
+def test_a_reading_that_lacks_an_axis_is_none() -> None:
+    """The gyroscope's is bridged by its neighbours; one of the magnetometer alone is its interval's mean."""
+    rng = np.random.default_rng(3)
+    gyroscope, magnetometer = np.outer(T, [0.1, 0.2, 0.3]), np.full((len(T), 3), np.nan)
+    at = np.flatnonzero((T > 1.8) & (T < 1.9))
+    magnetometer[at] = rng.normal(size=(len(at), 3))
+    magnetometer[at[1:], rng.integers(0, 3, len(at) - 1)] = np.nan
+    expected = integrated(gyroscope, gyroscope, magnetometer, np.zeros(3))
+    lacking = gyroscope.copy()
+    lacking[120, 1] = np.nan
+    found = integrated(lacking, gyroscope, magnetometer, np.zeros(3))
+    np.testing.assert_array_equal(found.count, [0.0, 1.0, 0.0])
+    np.testing.assert_allclose(found.reading[1], magnetometer[at[0]])
+    np.testing.assert_allclose(found.turned, expected.turned, atol=1e-12)
 
 
 def test_a_rate_that_grows_evenly_in_closed_form() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import welch
 
 from fieldcal.estimation.by_velocity.walk import walk_density
 from fieldcal.estimation.joint.problem import Readings
@@ -45,6 +46,27 @@ def test_noise_above_the_band_is_not_the_walks() -> None:
     shaken = noise + 100.0 * SD * np.sin(2.0 * np.pi * 60.0 * t)[:, None]
     found = walk_density(readings(t, np.zeros(len(t), dtype=int), shaken), shaken, np.ones(3))
     assert found == pytest.approx(SD**2 / 200.0, rel=0.12)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "lowest_hz", "highest_hz"),
+    [(200.0, 10.0, 40.0), (25.5, 6.375, 12.75), (16.0, 4.0, 8.0)],
+    ids=["10 to 40 Hz, both counted", "the upper half", "sixteen readings a second"],
+)
+def test_half_the_median_over_the_band_of_scipys_spectrum_of_four_seconds(
+    rate_hz: float, lowest_hz: float, highest_hz: float
+) -> None:
+    """A reading that lacks an axis is bridged by its neighbours."""
+    t, logged = noisy(rate_hz, seed=7, length_s=60.0)
+    logged *= 1.0 + t[:, None]
+    logged[100, 1] = np.nan
+    scale = np.array([1.0, 2.0, 3.0])
+    bridged = logged.copy()
+    bridged[100] = 0.5 * (logged[99] + logged[101])
+    frequency, density = welch(bridged * scale, rate_hz, nperseg=round(4.0 * rate_hz), axis=0)
+    band = (frequency > lowest_hz - 1e-9) & (frequency < highest_hz + 1e-9)
+    found = walk_density(readings(t, np.zeros(len(t), dtype=int), logged), logged, scale)
+    assert found == pytest.approx(0.5 * np.mean(np.median(density[band], axis=0)), rel=1e-9)
 
 
 def test_the_longest_stretch_tells_and_gaps_in_it_do_not_matter() -> None:

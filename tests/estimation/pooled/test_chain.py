@@ -68,7 +68,7 @@ def test_every_session_and_any_day_is_what_least_squares_say(rows: int) -> None:
     """Sessions of one reading alone determine nothing by themselves."""
     observed, prior = told(rows, rows), np.array([0.0, 0.2, 0.0, 0.0])
     found = chain(observed, prior)
-    days = np.sort(np.r_[-1.5, DAY, 2.0, 5.5, 20.0])
+    days = np.sort(np.r_[-1.5, DAY, 0.25, 2.0, 5.5, 20.0])
     state, covariance = all_at_once(observed, days, prior)
     for day, x, c in zip(days, state, covariance, strict=True):
         own = found.at(day).estimate()
@@ -139,10 +139,18 @@ def test_loosened_without_bound_leaves_what_the_others_share() -> None:
     own = known(*told(6, 6)[0])
     found = own.loosened(np.array([np.inf, 0.0, 0.0, 0.0]))
     assert not found.information[0].any()
+    assert found.right[0] == 0.0
     rest = np.linalg.inv(found.information[1:, 1:])
     np.testing.assert_allclose(rest, np.linalg.inv(own.information)[1:, 1:], rtol=RTOL)
     great = own.loosened(np.array([1e9, 0.0, 0.0, 0.0]))
     np.testing.assert_allclose(great.information, found.information, atol=1e-6)
+
+
+def test_of_what_is_not_known_an_error_takes_nothing() -> None:
+    own = Known(np.diag([0.0, 2.0]), np.array([0.0, 3.0]))
+    found = own.loosened(np.array([np.inf, 0.0]))
+    np.testing.assert_array_equal(found.information, own.information)
+    np.testing.assert_array_equal(found.right, own.right)
 
 
 def test_a_jump_lets_the_sessions_before_it_tell_nothing_of_the_constant() -> None:

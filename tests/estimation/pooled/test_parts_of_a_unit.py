@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from fieldcal.estimation.normal_equations import NormalEquations
-from fieldcal.estimation.pooled.chain import Known
+from fieldcal.estimation.pooled.chain import Estimate, Known
 from fieldcal.estimation.pooled.strengths import Strengths
 from fieldcal.estimation.pooled.unit import (
     Flight,
+    LeftOut,
     Pooled,
     Step,
     Unit,
@@ -17,6 +19,7 @@ from fieldcal.estimation.pooled.unit import (
     first_strengths,
     jumps,
     pool,
+    said_beside,
     series_of_sessions,
     smoothed,
     state_of,
@@ -58,6 +61,13 @@ def test_of_a_flight_that_sees_two_combinations_of_four_two_can_contradict() -> 
     assert contradiction(Known.nothing(4), expected) == (0.0, 0)
     for unit in (1e-4, 1.0, 1e4):
         assert contradiction(Known(unit**2 * np.eye(4), np.ones(4)), Known.nothing(4)) == (0.0, 0)
+
+
+def test_only_what_others_know_of_can_be_contradicted() -> None:
+    """Of two readings the others expect one, with as large a variance."""
+    chi2, count = contradiction(Known(np.eye(2), np.array([5.0, 7.0])), Known(np.diag([1.0, 0.0]), np.zeros(2)))
+    assert count == 1
+    assert chi2 == pytest.approx(5.0**2 / 2.0, rel=1e-5)
 
 
 @pytest.mark.parametrize(("variance", "count"), [(0.9e4, 1), (1.1e4, 0)])
@@ -116,6 +126,9 @@ def test_a_flights_constants_are_those_of_the_state_at_its_temperature_and_day(
     )
     np.testing.assert_allclose(found.information, design.T @ own.information @ design)
     np.testing.assert_allclose(found.right, design.T @ own.information @ (x + reference))
+    now = state_of(Flight(equations, 0, warmth), NAMES, (0, 2), -2.5, (0, 2))
+    design[:, 5:] = 0.0  # unless it is said, on the last day
+    np.testing.assert_allclose(now.information, design.T @ own.information @ design, atol=1e-12)
 
 
 def sessions_of(rng: np.random.Generator, days: Array) -> tuple[Unit, list[tuple[Array, Array]]]:
@@ -332,6 +345,95 @@ def test_it_takes_two_sessions_on_either_side_of_a_step(after: int, named: bool)
     if found is not None and named:
         assert found[1].size == pytest.approx(100.0, rel=1e-5)
         assert found[1].sd == pytest.approx(np.sqrt(1.0 / after + 1.0 / (6 - after)), rel=1e-5)
+
+
+def test_a_step_of_what_walks_is_that_of_generalised_least_squares() -> None:
+    """Sessions whose errors share the walk since the first of them: a level and a step."""
+    day, walk, after = np.array([0.0, 1.0, 4.0, 4.5, 9.0, 12.0]), 0.3, 3
+    value = np.random.default_rng(14).normal(size=6) + 30.0 * (np.arange(6) >= after)
+    flights = [
+        Flight(NormalEquations((LEVER,), np.zeros(1), np.array([v]), np.eye(1)), k, None) for k, v in enumerate(value)
+    ]
+    unit, kinds = Unit(tuple(flights), day), {LEVER[:2]: Strengths(walk, 0.5, 0.0)}
+    found = surest_step(smoothed(unit, kinds, (), (), ()), np.array([1e6]))
+    weight = np.linalg.inv(1.5 * np.eye(6) + walk * np.minimum.outer(day, day))
+    design = np.column_stack([np.ones(6), np.arange(6) >= after])
+    covariance = np.linalg.inv(design.T @ weight @ design)
+    assert found is not None
+    assert found[1].after == after
+    assert found[1].size == pytest.approx((covariance @ design.T @ weight @ value)[1], rel=RTOL)
+    assert found[1].sd == pytest.approx(np.sqrt(covariance[1, 1]), rel=RTOL)
+
+
+def test_of_a_constant_of_which_the_last_session_says_next_to_nothing_there_is_no_distance() -> None:
+    """Of two that each session sees by themselves; nor do both have to be seen for a drift of one to be named."""
+    gain = ("gyroscope", "lever", "y")
+    flights = [
+        Flight(NormalEquations((LEVER, gain), np.zeros(2), n * v * np.ones(2), np.diag(n)), k, None)
+        for k, (v, n) in enumerate(
+            zip(50.0 * np.arange(6.0), [np.full(2, 9.0)] * 5 + [np.array([9.0, 1e-7])], strict=True)
+        )
+    ]
+    found = pool(Unit(tuple(flights), np.arange(6.0)), {LEVER[:2]: Strengths(0.0, 1.0, 0.0)}, tested=False)
+    assert list(np.isfinite(found.last_z())) == [True, False]
+    assert surest_drift(found, np.full(2, 1e6)) is not None
+
+
+@pytest.mark.parametrize("share", [0.995, 1.005])
+def test_a_step_a_drift_and_a_contradiction_are_named_where_one_in_three_hundred_units_would_have_one(
+    share: float,
+) -> None:
+    """By what a normal number exceeds, among all that are looked at: three places of a step, one rate, nine flights.
+    Sessions of scatter 1: the mean of m of them has sd √(1/m), a straight line's slope √(1/Σ(t − t̄)²), and one of eight
+    is √(1 + 1/7) from the mean of the others; the ninth flight sees nothing."""
+    sure = np.array([1e8])
+
+    def beyond(among: int) -> float:
+        return share * float(norm.isf(0.5 * 0.003 / among))
+
+    day = np.arange(6.0)
+    step = beyond(3) * np.sqrt(2.0 / 3.0) * (day >= 3)
+    assert (surest_step(line(day, step, 1.0), sure) is not None) == (share > 1.0)
+    rate = beyond(1) / np.sqrt(np.sum((day - 2.5) ** 2))
+    assert (surest_drift(line(day, rate * day, 1.0), sure) is not None) == (share > 1.0)
+    off = np.where(np.arange(8) == 3, beyond(9) * np.sqrt((1.0 + 1e-3) * (1.0 + 1.0 / 7.0)), 0.0)
+    flights = [
+        Flight(NormalEquations((LEVER,), np.zeros(1), np.array([1e3 * v]), 1e3 * np.eye(1)), k, None)
+        for k, v in enumerate(off)
+    ]
+    silent = Flight(NormalEquations((LEVER,), np.zeros(1), np.zeros(1), np.zeros((1, 1))), 4, None)
+    kinds = {LEVER[:2]: Strengths(0.0, 1.0, 0.0, 1e8)}
+    found = pool(Unit((*flights[:7], silent, flights[7]), np.arange(8.0)), kinds)
+    assert [one.flight for one in found.left_out] == ([3] if share > 1.0 else [])
+
+
+def test_what_a_session_expects_of_a_flight_is_said_by_no_flight_that_was_left_out() -> None:
+    """Three flights of a session, of which one was: by the others, at its time and without more scatter."""
+    day, rng = np.arange(3.0), np.random.default_rng(13)
+    flights = [
+        Flight(NormalEquations((LEVER,), np.zeros(1), rng.normal(size=1), np.array([[1.0 + k]])), s, None)
+        for k, s in enumerate([0, 1, 1, 1, 2])
+    ]
+    kinds = {LEVER[:2]: Strengths(0.7, 0.0, 0.0)}
+    whole = smoothed(Unit(tuple(flights), day), kinds, (), (LeftOut(2, 9.0, 1),), ())
+    few = smoothed(Unit((flights[0], flights[3], flights[4]), day), kinds, (), (), ())
+    found, expected = whole.expected(1).estimate(), few.at(1.0)
+    np.testing.assert_allclose(found.state, expected.state, rtol=RTOL)
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=RTOL)
+
+
+@pytest.mark.parametrize(("share", "told_something"), [(0.95e-4, False), (1.05e-4, True)])
+def test_a_part_that_adds_less_than_a_ten_thousandth_says_nothing(share: float, told_something: bool) -> None:
+    """Value and variance of the part are those whose weighted mean with the rest is what both know."""
+    one = np.ones(1)
+    together, before = (Estimate(v * one, v * np.eye(1)) for v in (2.0, 2.0 / (1.0 - share)))
+    said = said_beside(before, together, one)
+    assert (said is not None) == told_something
+    if said is not None:
+        value, variance = said
+        assert variance == pytest.approx(2.0 / share, rel=RTOL)
+        rest = before.covariance[0, 0]
+        assert (value / variance + before.state[0] / rest) * 2.0 == pytest.approx(2.0, rel=RTOL)
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq, minimize
 from scipy.stats import norm
 
 import fieldcal.estimation.pooled.strengths as module
@@ -112,6 +113,10 @@ def test_the_largest_likely_strength_is_where_the_likelihood_has_fallen_by_half_
     for i, steep in ((0, 1.0), (1, 4.0)):
         assert largest_likely(cost, best, 5.0, i) == pytest.approx(best[i] + np.sqrt(RISE / steep), abs=0.02)
     np.testing.assert_array_equal(best, [1.0, -2.0])
+    # A sd a thousand times a session's own is the largest that is looked for.
+    for rises_at, found in ((2.0 * np.log(990.0), 2.0 * np.log(990.0)), (2.0 * np.log(1010.0), 1.0)):
+        rising = largest_likely(lambda x, at=rises_at: RISE * (1.0 + x[0] - at), best, 0.0, 0)
+        assert rising == pytest.approx(found, abs=0.02)
     # A likelihood that never falls so far tells nothing: the likeliest stays.
     assert largest_likely(lambda x: 0.01 * x[0], best, 0.01, 0) == 1.0
 
@@ -139,9 +144,60 @@ def test_a_walk_or_a_slope_as_large_as_the_scatter_is_that_unlikely(strengths: S
 def test_two_sessions_of_a_series_are_compared() -> None:
     rng = np.random.default_rng(4)
     rows = [np.column_stack([[0.0, 4.0], [0.0, 0.0], rng.normal(size=2), np.full(2, 0.01)]) for _ in range(30)]
+    rows.append(rows[0][:1])  # of which there is nothing to compare
     found = strengths_of(Series.of(rows), with_slope=False)
     assert 20.0 + FEW < found.freedom <= 30.0 + FEW
     assert 0.4 < found.scatter < 2.0
+    assert found.slope == 0.0
+
+
+def moving(seed: int, series: int = 12, sessions: int = 8) -> list[np.ndarray]:
+    """Series that walk, scatter and slope, one of which steps."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for k in range(series):
+        day, warmth = np.cumsum(rng.uniform(1.0, 9.0, sessions)), rng.uniform(-20.0, 10.0, sessions)
+        value = 0.1 * rng.normal() * warmth + np.cumsum(0.3 * rng.normal(size=sessions)) + rng.normal(size=sessions)
+        rows.append(np.column_stack([day, warmth, value + 40.0 * (k == 0) * (day > 20.0), np.full(sessions, 0.2)]))
+    return rows
+
+
+def test_strengths_are_the_largest_that_are_likely_by_all_that_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Innovations, of which one that starts a series anew counts 4.5², what was expected, and pairs of a session;
+    minimised, and left where each has risen by `RISE`, by SciPy from another start."""
+    monkeypatch.setattr(module, "TOLERANCES", {"fatol": 1e-7, "xatol": 1e-6})
+    series = Series.of(moving(6))
+    pairs = np.array([[7.0, 1.0, 0.3], [-9.0, -0.3, 0.5], [12.0, 1.1, 0.4], [11.0, -2.0, 0.2]])
+    own, gap = 0.2, float(np.median(np.diff(series.day, axis=0)))
+    spread = float(np.std(series.warmth_degc))
+    unit = np.array([own / gap, own, own / spread**2])
+
+    def cost(x: np.ndarray) -> float:
+        walk, scatter, slope = unit * np.exp(x)
+        z, variance = innovations(series, Strengths(walk, scatter, slope))
+        at = np.isfinite(z)
+        likelihood = np.sum(np.log(variance[at]) + z[at] ** 2) + 4.5**2 * np.sum(~at)
+        expected = unlikely(scatter / own) + unlikely(slope * spread**2 / own)
+        expected += beside_scatter(Strengths(walk, scatter, slope), gap, spread)
+        return float(likelihood + expected + of_pairs(pairs, slope, own))
+
+    best = minimize(cost, np.full(3, 1.0), method="Powell", options={"xtol": 1e-7, "ftol": 1e-12})
+    largest = []
+    for i in range(3):
+        way = np.eye(3)[i]
+        largest.append(best.x[i] + brentq(lambda by, way=way: cost(best.x + by * way) - best.fun - 0.3, 0.0, 5.0))
+    found = strengths_of(series, within=pairs)
+    np.testing.assert_allclose([found.walk, found.scatter, found.slope], unit * np.exp(largest), rtol=2e-3)
+    assert found.freedom == FEW + 12 * 7 - 1
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_in_another_unit_strengths_are_the_same(unit: float) -> None:
+    rows = moving(6)
+    plain = strengths_of(Series.of(rows))
+    found = strengths_of(Series.of([own * [1.0, 1.0, unit, unit**2] for own in rows]))
+    for each in ("walk", "scatter", "slope"):
+        assert getattr(found, each) == pytest.approx(unit**2 * getattr(plain, each), rel=1e-6)
 
 
 def test_another_start_and_a_nearer_end_find_the_same_strengths(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,6 +211,7 @@ def test_another_start_and_a_nearer_end_find_the_same_strengths(monkeypatch: pyt
     for name, value in (
         ("START", (0.3, 0.3, 0.3)),
         ("TIMES", (1.2, 5.0, 20.0)),
+        ("LIMITS", (2.0 * np.log(1e-4), module.LIMITS[1])),
         ("TOLERANCES", {"fatol": 0.001, "xatol": 0.002}),
     ):
         with monkeypatch.context() as patch:
@@ -162,6 +219,17 @@ def test_another_start_and_a_nearer_end_find_the_same_strengths(monkeypatch: pyt
             found = strengths_of(Series.of(rows))
         for each in ("walk", "scatter", "slope"):
             assert getattr(found, each) == pytest.approx(getattr(plain, each), rel=0.1), (name, each)
+
+
+@pytest.mark.parametrize("power", [-61, -1, 0, 7, 40])
+def test_coarse_strengths_are_the_nearest_power_of_one_and_a_quarter(power: int) -> None:
+    """Within half a step of their logarithm; of none there is none, and innovations are whole."""
+    exact = 1.25**power
+    for within in (-0.49, 0.0, 0.49):
+        near = exact * 1.25**within
+        found = Strengths(near, 0.0, near, near).coarse()
+        assert (found.walk, found.scatter, found.slope) == (pytest.approx(exact), 0.0, pytest.approx(exact))
+        assert found.freedom == round(exact)
 
 
 def test_two_flights_of_a_session_differ_as_likely_as_a_normal_number() -> None:
