@@ -51,7 +51,7 @@ class Tally:
     undefined: Counter[int] = field(default_factory=Counter)
     stretches: int = 0
     damaged_bytes: int = 0
-    damaged_at: int = -1
+    damaged_at: int | None = None
     cut: int = 0
     redefined: Counter[str] = field(default_factory=Counter)
 
@@ -79,7 +79,7 @@ class DataflashFile:
         wanted = {i for i, layout in self.layouts.items() if layout.name in names or layout.name in SELF_DESCRIPTION}
         parts: dict[int, list[NDArray[np.int64]]] = {type_id: [] for type_id in wanted}
         for starts, types in self._walk():
-            counts = np.bincount(types, minlength=256)
+            counts = np.bincount(types)
             for type_id in np.flatnonzero(counts).tolist():
                 limit = self._redefined_at.get(type_id)
                 if type_id not in wanted and limit is None:
@@ -202,7 +202,7 @@ class DataflashFile:
     def _last(self, first: int, sizes: NDArray[np.int64]) -> None:
         """Account for the file's end behind its last whole message."""
         head = self.content[first : first + HEAD_BYTES].tobytes()
-        begun = MARK.startswith(head[:2]) if len(head) < HEAD_BYTES else head[:2] == MARK
+        begun = MARK.startswith(head[:2])
         if begun and (len(head) < HEAD_BYTES or first + sizes[head[2]] > self.size):
             self.tally.cut = self.size - first
         else:
