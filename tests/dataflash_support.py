@@ -54,7 +54,10 @@ def own_fmt() -> bytes:
 def packed(type_id: int, name: str, letters: str, columns: Mapping[str, Sequence[Any]]) -> tuple[bytes, bytes]:
     """The definition of a message and its rows, packed by struct. Letter c and its like take what is stored."""
     layout = struct.Struct("<2sB" + "".join(PACK[letter] for letter in letters))
-    rows = [[v for one in row for v in (one if isinstance(one, range) else (one,))] for row in zip(*columns.values())]
+    rows = [
+        [v for one in row for v in (one if isinstance(one, range) else (one,))]
+        for row in zip(*columns.values(), strict=True)
+    ]
     content = b"".join(layout.pack(b"\xa3\x95", type_id, *row) for row in rows)
     return fmt(type_id, layout.size, name, letters, ",".join(columns)), content
 

@@ -12,7 +12,7 @@ from dataflash_support import PACK, DataflashFlight, by_pymavlink, fmt, own_fmt,
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.dataflash import file as dataflash_file
 from fieldcal.logs.dataflash.file import DataflashFile
-from fieldcal.logs.dataflash.records import LETTERS, multipliers, parse_fmt
+from fieldcal.logs.dataflash.records import FMT_LAYOUT, LETTERS, multipliers, parse_fmt
 
 EXTREMES = {
     "b": (-128, 127),
@@ -157,6 +157,10 @@ def test_multipliers_need_every_column_of_both_messages(tmp_path: Path, missing:
 def test_definitions_that_contradict_themselves(message: bytes, columns: tuple[str, ...] | None) -> None:
     layout = parse_fmt(message)
     assert (None if layout is None else layout.columns) == columns
+
+
+def test_the_definition_of_definitions_is_the_one_that_logs_begin_with() -> None:
+    assert parse_fmt(own_fmt()) == FMT_LAYOUT
 
 
 def test_a_type_whose_length_is_wrong_is_stepped_over(tmp_path: Path) -> None:

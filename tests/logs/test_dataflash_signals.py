@@ -41,10 +41,14 @@ def imu_rows(t_us: Sequence[int], names: Sequence[str] = IMU, **more: Sequence[i
 
 
 @pytest.mark.parametrize(
-    ("t_us", "rate"), [([], 0), ([5], 0), ([5, 5], 0), ([0, 20_000], 50), ([0, 10_000, 20_000, 90_000], 100)]
+    ("t_us", "rate"),
+    [([], 0), ([5], 0), ([5, 5], 0), ([0, 20_000], 50), ([0, 10_000, 20_000, 90_000], 100), ([0, 1], 10**6)],
 )
+@pytest.mark.filterwarnings("error")
 def test_a_rate_is_that_of_the_usual_interval(t_us: list[int], rate: float) -> None:
-    assert stream_of("T", "Q", {"TimeUS": t_us}).rate_hz == rate
+    stream = stream_of("T", "Q", {"TimeUS": t_us})
+    assert stream.rate_hz == rate
+    assert Stream(0, "T", stream.rows, stream.t_ns // 1000).rate_hz == 1000 * rate
 
 
 @pytest.mark.parametrize(("rows", "sizes"), [(0, []), (2, [2]), (3, [3]), (4, [3, 1]), (7, [3, 3, 1])])
@@ -71,13 +75,12 @@ def test_instances_by_a_field_come_before_those_by_name(tmp_path: Path, field: s
 
 
 def test_instances_by_name_alone(tmp_path: Path) -> None:
-    messages = [(f"ACC{n}", "Qfff", imu_rows([n], IMU[3:])) for n in (1, 2, 3)]
-    found = signals.streams(file_of(tmp_path / "a.bin", *messages), "ACC", IMU[3:], {})
-    assert {i: (one.name, one.t_ns.tolist()) for i, one in found.items()} == {
-        0: ("ACC1", [1000]),
-        1: ("ACC2", [2000]),
-        2: ("ACC3", [3000]),
-    }
+    for first in ("ACC", "ACC1"):
+        names = (first, "ACC2", "ACC3")
+        messages = [(name, "Qfff", imu_rows([n], IMU[3:])) for n, name in enumerate(names, 1)]
+        found = signals.streams(file_of(tmp_path / f"{first}.bin", *messages), "ACC", IMU[3:], {})
+        told = {i: (one.instance, one.name, one.t_ns.tolist()) for i, one in found.items()}
+        assert told == {n: (n, name, [1000 * n + 1000]) for n, name in enumerate(names)}
 
 
 def test_messages_without_a_needed_column_or_a_stamp_are_counted(tmp_path: Path) -> None:
@@ -94,6 +97,7 @@ def test_messages_without_a_needed_column_or_a_stamp_are_counted(tmp_path: Path)
     [
         ("QQ", {"TimeUS": [1000], "SampleUS": [990]}, 990),
         ("QI", {"TimeUS": [(1 << 32) + 10], "S": [(1 << 32) - 5]}, (1 << 32) - 5),
+        ("QI", {"TimeUS": [(3 << 32) + 10], "S": [5]}, (3 << 32) + 5),
         ("QQ", {"TimeUS": [(1 << 32) + 10], "S": [5]}, (1 << 32) + 10),  # 64 bits do not wrap
         ("QQI", {"TimeUS": [1000], "SampleUS": [990], "S": [980]}, 990),
         ("QI", {"TimeUS": [1000], "Other": [990]}, 1000),
@@ -157,6 +161,7 @@ def test_velocity_by_speed_and_course() -> None:
         (1_499_999, 0.25),
         (1_500_001, 0.5),
         (2_000_000, 0.5),
+        (2_400_000, 0.5),
         (2_600_000, 654.99),
         (3_600_000, None),  # 655 and more says nothing
         (5_000_000, None),
@@ -178,9 +183,7 @@ def test_speed_accuracy_is_the_nearest_within_a_second(at_us: int, sd: float | N
 
 @pytest.mark.parametrize(("angles", "letters"), [(("Roll", "Pitch", "Yaw"), "fff"), (("R", "P", "Y"), "fff")])
 @pytest.mark.parametrize(("taken", "t_ns"), [({"CTimeMS": [4990]}, 4_990_000_000), ({}, 5_000_000_000)])
-def test_a_pose_by_its_angles(
-    angles: tuple[str, ...], letters: str, taken: dict[str, list[int]], t_ns: int
-) -> None:
+def test_a_pose_by_its_angles(angles: tuple[str, ...], letters: str, taken: dict[str, list[int]], t_ns: int) -> None:
     columns = {"TimeUS": [5_000_000], **taken, "PX": [1.0], "PY": [2.0], "PZ": [3.0]}
     columns |= dict(zip(angles, ([0.0], [0.0], [90.0]), strict=True))
     found = signals.vps(stream_of("VISP", "Q" + "I" * len(taken) + "fff" + letters, columns))
@@ -189,28 +192,43 @@ def test_a_pose_by_its_angles(
     assert [found[f"p{axis}_m"].tolist() for axis in "xyz"] == [[1.0], [2.0], [3.0]]
 
 
+def axes_of(sensor: str, t_us: Sequence[int]) -> dict[str, Sequence[Any]]:
+    """Readings that number the rows: x from 0 on, or 3 of the accelerometer, y and z from one more each."""
+    whole = imu_rows(t_us)
+    return {name: column for name, column in whole.items() if name.startswith(("Time", sensor.capitalize()))}
+
+
 @pytest.mark.parametrize(
-    ("first_us", "step_us", "count", "taken"),
+    ("step_us", "count", "taken"),
     [
-        (0, 10_000, 101, True),
-        (0, 20_000, 51, False),  # 1.5 times the rate and no more
-        (0, 19_999, 52, True),
-        (0, 10_000, 91, True),  # 0.9 of the time
-        (0, 10_000, 90, False),
+        (10_000, 101, True),
+        (20_000, 51, False),  # 1.5 times the rate and no more
+        (19_999, 52, True),
+        (10_000, 91, True),  # 0.9 of the time
+        (10_000, 90, False),
     ],
 )
 def test_gyr_and_acc_are_taken_where_they_are_faster_and_span_the_flight(
-    tmp_path: Path, first_us: int, step_us: int, count: int, taken: bool
+    tmp_path: Path, step_us: int, count: int, taken: bool
 ) -> None:
-    t_us = 1_000_000 + first_us + step_us * np.arange(count)
+    t_us = 1_000_000 + step_us * np.arange(count)
     slow = ("IMU", "Qffffff", imu_rows((1_000_000 + np.array([0, 30_000, 60_000, 90_000, 1_000_000])).tolist()))
     whole = (1_000_000 + np.arange(0, 1_000_001, 5000)).tolist()
     for name, other in (("GYR", "ACC"), ("ACC", "GYR")):
         parts = [(name, "Qfff", t_us.tolist()), (other, "Qfff", whole)]
-        messages = [(n, f, imu_rows(t, IMU[:3] if n == "GYR" else IMU[3:])) for n, f, t in parts]
+        messages = [(f"{n}1", f, axes_of(n, t)) for n, f, t in parts]
         (unit,) = units.imus(file_of(tmp_path / "a.bin", slow, *messages), Parameters(None, ()), {})
         assert (unit.fast is not None) is taken
-    only = [one for one in messages if one[0] == "GYR"]
+        assert unit.stream == ("GYR1 and ACC1" if taken else "IMU")
+        joined = unit.joined()
+        assert (joined is not None) is taken
+        if joined is not None and name == "ACC":
+            inside = [t * 1000 for t in whole if t <= t_us[-1]]
+            assert joined.columns["t_ns"].tolist() == inside
+            assert joined.columns["gyroscope_y"].tolist() == [1.0 + i for i in range(len(inside))]
+            rows = (np.array(inside) / 1000 - t_us[0]) / step_us
+            assert np.allclose(joined.columns["accelerometer_z"], 5.0 + rows, rtol=1e-12)
+    only = [one for one in messages if one[0] == "GYR1"]
     (unit,) = units.imus(file_of(tmp_path / "a.bin", slow, *only), Parameters(None, ()), {})
     assert unit.fast is None
 
@@ -260,3 +278,57 @@ def test_units_in_use_come_first_and_are_told_with_their_tables() -> None:
         ("magnetometer", "magnetometer", "instance-0", True, False, None),
         ("magnetometer", "magnetometer.1", "9", False, False, 9),
     ]
+
+
+@pytest.mark.parametrize(
+    ("options", "filtered"), [(0, False), (3, False), (4, True), (8, False), (12, False), (20, True)]
+)
+def test_a_bit_of_the_options_says_whether_gyr_is_filtered(tmp_path: Path, options: int, filtered: bool) -> None:
+    t_us = list(range(0, 1000, 10))
+    messages = [("IMU", "Qffffff", imu_rows(t_us[::2])), ("IMU2", "Qffffff", imu_rows(t_us[::2]))]
+    messages += [(f"{n}1", "Qfff", axes_of(n, t_us)) for n in ("GYR", "ACC")]
+    file = file_of(tmp_path / "a.bin", *messages)
+    found = units.imus(file, Parameters.of({"INS_RAW_LOG_OPT": float(options)}), {})
+    assert [(unit.slow.instance, unit.fast is not None, unit.filtered) for unit in found] == [
+        (0, True, filtered),
+        (1, False, True),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("use", "order"), [({}, [0, 1, 2]), ({"": 0}, [1, 2, 0]), ({"2": 0}, [0, 2, 1]), ({"": 0, "2": 0}, [2, 0, 1])]
+)
+def test_the_first_unit_that_may_be_used_is_the_primary_one(
+    tmp_path: Path, use: dict[str, float], order: list[int]
+) -> None:
+    mag = {"MagX": [1], "MagY": [2], "MagZ": [3]}
+    file = file_of(
+        tmp_path / "a.bin",
+        ("IMU", "QBffffff", imu_rows([1, 2, 3], I=[2, 0, 1])),
+        *((f"MAG{n}", "Qhhh", {"TimeUS": [1], **mag}) for n in ("", "2", "3")),
+    )
+    imus = units.imus(file, Parameters.of({f"INS_USE{n}": v for n, v in use.items()}), {})
+    assert [unit.slow.instance for unit in imus] == order
+    mags = units.magnetometers(file, Parameters.of({f"COMPASS_USE{n}": v for n, v in use.items()}), {})
+    assert [stream.instance for stream in mags] == order
+
+
+def test_corrections_begin_with_the_sensors_first_message_by_the_logs_clock() -> None:
+    names = [f"INS_{part}_{axis}" for part in ("GYROFFS", "ACCOFFS") for axis in "XYZ"]
+    held = Parameters.of({**dict.fromkeys(names, 0.5), "INS_TCAL1_ENABLE": 1.0, "COMPASS_OFS_X": 7.0})
+    unit = units.Unit(stream_of("IMU", "Qffffff", imu_rows([20, 10, 30])))
+    for source in units.imu_sources([unit], held, 5, LogSummary("dataflash"), "a.bin"):
+        (correction,) = source.corrections
+        assert (correction.from_ns, correction.temperature_degc) == (10_005, None)
+    old = units.Unit(stream_of("IMU", "Iffffff", {"TimeMS": [1, 2], **{n: [0, 0] for n in IMU}}))
+    turned = Parameters.of({**dict.fromkeys(names, 0.5), "AHRS_ORIENTATION": 4.0})
+    for one, offset in ((old, (-0.5, -0.5, -0.5)), (unit, (0.5, 0.5, -0.5))):  # before 3.3 board axes came first
+        source = units.imu_sources([one], turned, 0, LogSummary("dataflash"), "a.bin")[0]
+        assert source.corrections[0].offset == offset
+    columns = {"TimeUS": [30, 10, 20], "MagX": [0] * 3, "MagY": [0] * 3, "MagZ": [0] * 3}
+    offsets = {"OfsX": [3, 1, 1], "OfsY": [5] * 3, "OfsZ": [6] * 3}
+    whole = stream_of("MAG", "Qhhhhhh", columns | offsets)
+    part = stream_of("MAG", "Qhhhh", columns | {"OfsX": offsets["OfsX"]})
+    for stream, found in ((whole, [(10_005, (0.001, 0.005, 0.006)), (30_005, (0.003, 0.005, 0.006))]), (part, [])):
+        (source,) = units.magnetometer_sources([stream], Parameters(None, ()), 5, LogSummary("dataflash"), "a.bin")
+        assert [(one.from_ns, tuple(np.round(one.offset, 12))) for one in source.corrections] == found

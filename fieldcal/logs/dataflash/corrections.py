@@ -71,9 +71,7 @@ class Thermal:
 NO_THERMAL = Thermal(np.zeros((3, 3)), THERMAL_REFERENCE_DEGC, THERMAL_REFERENCE_DEGC, THERMAL_REFERENCE_DEGC)
 
 
-def inertial(
-    board: Array, offset: ArrayLike, scale: ArrayLike, thermal: Thermal, temperature_degc: float
-) -> Affine:
+def inertial(board: Array, offset: ArrayLike, scale: ArrayLike, thermal: Thermal, temperature_degc: float) -> Affine:
     """Gyroscope or accelerometer. `board` (3, 3), `offset` (3,), `scale` (3,), 1 for gyroscopes."""
     scale = np.broadcast_to(np.asarray(scale, float), 3)
     matrix = board * scale

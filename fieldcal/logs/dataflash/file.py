@@ -126,7 +126,7 @@ class DataflashFile:
             layout = parse_fmt(self._map[place : place + FMT_BYTES])
             if layout is not None and layout != self.layouts.setdefault(layout.type_id, layout):
                 self._redefined_at.setdefault(layout.type_id, place)
-            place = self._map.find(head, place + (1 if layout is None else FMT_BYTES))
+            place = self._map.find(head, place + (HEAD_BYTES if layout is None else FMT_BYTES))
         if len(self.layouts) == 1:
             raise UnreadableLog(
                 ReasonCode.NOT_AN_AUTOPILOT_LOG,
@@ -150,7 +150,7 @@ class DataflashFile:
             ends = heads + sizes[types]
             inside = int(np.searchsorted(heads, stop))
             follows, fits = self._successors(heads, ends, inside)
-            fits &= sizes[types[:inside]] > 0
+            fits &= sizes[types[:inside]].astype(bool)
             good = np.flatnonzero(fits)
             places = heads[good]
             # A run of messages ends at one that the next head does not follow: it is damaged, or looks like a head
@@ -181,7 +181,7 @@ class DataflashFile:
         follows = after == ends[:inside]
         fits = follows.copy()
         rest = np.flatnonzero(~follows)
-        places = np.minimum(np.searchsorted(heads, ends[rest]), max(len(heads) - 1, 0))
+        places = np.minimum(np.searchsorted(heads, ends[rest]), len(heads) - 1)
         fits[rest] = (heads[places] == ends[rest]) | (ends[rest] == self.size)
         for missing in (1, 2):  # a head that the file ends within
             begun = self.content[self.size - missing :].tobytes() == MARK[:missing]
