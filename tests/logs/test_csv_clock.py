@@ -91,8 +91,10 @@ def test_sample_numbers(bits: int) -> None:
 
 
 def test_numbers_without_unit_or_rate_count_seconds() -> None:
-    t, _ = FileClock(None, None, None).times(series([5, 6, 9]))
-    assert t.tolist() == [5 * S, 6 * S, 9 * S]
+    clock = FileClock(None, None, None)
+    t, _ = clock.times(series([253, 255, 0, 2]))
+    assert t.tolist() == [253 * S, 255 * S, 256 * S, 258 * S]
+    assert "after 256.000 s" in told(clock)[0][2]
 
 
 @pytest.mark.parametrize(
@@ -121,6 +123,8 @@ def test_a_pause_over_the_turn(unit: str | None, rate_hz: float | None, period: 
         ([253, 254, 255, -1, 1, 2], "none"),
         ([40 * i % 256 for i in range(20)], "clock_wrapped"),  # hardly seven rows a turn
         ([*[v for v in range(150, 250, 10) for _ in range(3)], *[40] * 3, *[50] * 3, *[60] * 3], "clock_wrapped"),
+        ([120, 160, 60, 200, 240, 24, 64, 104], "clock_wrapped"),  # a late row is no turn
+        ([120, 160, 32, 200, 240, 24, 64, 104], "clock_wrapped"),
         ([255, 0], "clock_reset"),  # of two rows nothing can be told
     ],
 )
@@ -153,6 +157,14 @@ def test_a_turn_is_found_whatever_the_blocks(split: int) -> None:
     t = np.concatenate([clock.times(series(part))[0] for part in (cells[:split], cells[split:])])
     assert (t // S).tolist() == [256 + v for v in (cells[0] + 256, *[v + 256 for v in true[1:]])]
     assert told(clock)[0][1] == 4
+
+
+def test_half_a_turn_is_none_in_either_direction() -> None:
+    clock = FileClock(None, 1.0, None)
+    first, _ = clock.times(series([1, 200, *range(201, 256), 0, 1, 2]))  # a jump before any turn is a jump
+    assert (first[[0, 1, -1]] // S).tolist() == [1, 200, 258]
+    t, _ = clock.times(series([200, 72, 172, 72, 250, 122, 250, 121]))
+    assert (t // S - 256).tolist() == [200 - 256, 72 - 256, 172 - 256, 72 - 256, 250 - 512, 122 - 512, 250 - 512, 121 - 256]
 
 
 @pytest.mark.parametrize("period_s", [1.0, 3.7])
