@@ -164,7 +164,16 @@ def test_half_a_turn_is_none_in_either_direction() -> None:
     first, _ = clock.times(series([1, 200, *range(201, 256), 0, 1, 2]))  # a jump before any turn is a jump
     assert (first[[0, 1, -1]] // S).tolist() == [1, 200, 258]
     t, _ = clock.times(series([200, 72, 172, 72, 250, 122, 250, 121]))
-    assert (t // S - 256).tolist() == [200 - 256, 72 - 256, 172 - 256, 72 - 256, 250 - 512, 122 - 512, 250 - 512, 121 - 256]
+    assert (t // S - 256).tolist() == [
+        200 - 256,
+        72 - 256,
+        172 - 256,
+        72 - 256,
+        250 - 512,
+        122 - 512,
+        250 - 512,
+        121 - 256,
+    ]
 
 
 @pytest.mark.parametrize("period_s", [1.0, 3.7])

@@ -64,7 +64,16 @@ def test_dates_end_where_nanoseconds_do() -> None:
 
 
 def test_times_as_numbers_round_half_up_and_end_where_nanoseconds_do() -> None:
-    cells = ["1.0000000004", "1.0000000005", "1.00000000049", "-1.0000000005", "9223372035.9", "9223372036", "-0.5", "+2"]
+    cells = [
+        "1.0000000004",
+        "1.0000000005",
+        "1.00000000049",
+        "-1.0000000005",
+        "9223372035.9",
+        "9223372036",
+        "-0.5",
+        "+2",
+    ]
     wanted = [S, S + 1, S, -S - 1, 9_223_372_035_900_000_000, None, -S // 2, 2 * S]
     assert nanoseconds(pl.Series(cells), "s").to_list() == wanted
     most = 2**63 - 2
@@ -83,7 +92,22 @@ def test_a_time_with_an_exponent_has_at_most_a_hundred_characters() -> None:
 
 
 def test_sample_numbers_are_whole_and_exact() -> None:
-    cells = ["0", " 7 ", "-3", "2.0", "2.5", "", "x", "inf", "nan", str(2**53 - 1), str(2**53), str(1 - 2**53), str(-(2**53)), None]
+    cells = [
+        "0",
+        " 7 ",
+        "-3",
+        "2.0",
+        "2.5",
+        "",
+        "x",
+        "inf",
+        "nan",
+        str(2**53 - 1),
+        str(2**53),
+        str(1 - 2**53),
+        str(-(2**53)),
+        None,
+    ]
     wanted = [0, 7, -3, 2, None, None, None, None, None, 2**53 - 1, None, 1 - 2**53, None, None]
     assert sample_numbers(pl.Series(cells, dtype=pl.String)).to_list() == wanted
 
