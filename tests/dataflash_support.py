@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import struct
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,12 @@ import numpy as np
 from pymavlink import DFReader
 
 from fieldcal.logs.dataflash import write
+from fieldcal.logs.dataflash.records import Rows, parse_fmt
+
+FMT = struct.Struct("<3sBB4s16s64s")
+PACK = {letter: letter for letter in "bBhHiIqQfd"} | dict(zip("cCeELMg", "hHiIiBe", strict=True))
+PACK |= {"n": "4s", "N": "16s", "Z": "64s", "a": "32h"}
+"""Format letter → how struct packs it."""
 
 WEEK, WEEK_MS = 2300, 345_600_000
 LEAP_NS = 18 * 10**9
@@ -31,6 +39,38 @@ PARAMETERS = {
     "COMPASS_DEV_ID": 97539.0,
     "COMPASS_EXTERNAL": 1.0,
 }
+
+
+def fmt(type_id: int, size: int, name: str, letters: str, columns: str) -> bytes:
+    """A definition as it stands in a log."""
+    return FMT.pack(b"\xa3\x95\x80", type_id, size, name.encode(), letters.encode(), columns.encode())
+
+
+def own_fmt() -> bytes:
+    """FMT's own, with which logs begin."""
+    return fmt(128, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")
+
+
+def packed(type_id: int, name: str, letters: str, columns: Mapping[str, Sequence[Any]]) -> tuple[bytes, bytes]:
+    """The definition of a message and its rows, packed by struct. Letter c and its like take what is stored."""
+    layout = struct.Struct("<2sB" + "".join(PACK[letter] for letter in letters))
+    rows = [
+        [v for one in row for v in (one if isinstance(one, range) else (one,))]
+        for row in zip(*columns.values(), strict=True)
+    ]
+    content = b"".join(layout.pack(b"\xa3\x95", type_id, *row) for row in rows)
+    return fmt(type_id, layout.size, name, letters, ",".join(columns)), content
+
+
+def rows_of(
+    name: str, letters: str, columns: Mapping[str, Sequence[Any]], *, multipliers: Mapping[str, float] | None = None
+) -> Rows:
+    """Messages as a log's pass would have found them."""
+    definition, content = packed(130, name, letters, columns)
+    layout = parse_fmt(definition)
+    assert layout is not None
+    starts = np.arange(len(content) // layout.size, dtype=np.int64) * layout.size
+    return Rows(layout, np.frombuffer(content, np.uint8), starts, multipliers or {})
 
 
 class DataflashFlight:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mutation_table.reasons import ANY_NEGATIVE, AT_A_TIME, LOOKED_AT, REFUSED_NEXT, ROOM, WIDTHS
+from mutation_table.reasons import ANY_NEGATIVE, AT_A_TIME, LOOKED_AT, RCOND, REFUSED_NEXT, ROOM, UNREAD, WIDTHS
 
 EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("logs.csv.dialect", "", "_LINES_LOOKED_AT = 50", "50 → 55"): LOOKED_AT,
@@ -39,6 +39,103 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "self.unterminated = False",
         "False → True",
     ): "told once iterated, which sets it anew",
+    (
+        "logs.dataflash.clock",
+        "sampled_ns",
+        "behind_us = (behind_us + (1 << (bits - 1))) % (1 << bits) - (1 << (bits - 1))",
+        "+ → -",
+    ): "half a turn ahead and half a turn back are the same",
+    ("logs.dataflash.file", "", "CHUNK_BYTES = 1 << 24", "1 → 2"): AT_A_TIME,
+    ("logs.dataflash.file", "", "CHUNK_BYTES = 1 << 24", "24 → 26"): AT_A_TIME,
+    ("logs.dataflash.file", "DataflashFile._walk", "sizes = np.zeros(256, np.int64)", "256 → 281"): UNREAD,
+    ("logs.dataflash.file", "DataflashFile._walk", "stop = min(at + CHUNK_BYTES, self.size)", "min → max"): AT_A_TIME,
+    (
+        "logs.dataflash.file",
+        "DataflashFile._walk",
+        "begin_or_end = np.zeros(inside + 1, np.int8)",
+        "1 → 2",
+    ): "a place more that is not read",
+    (
+        "logs.dataflash.file",
+        "DataflashFile._walk",
+        "if expected < self.size:",
+        "< → <=",
+    ): "of a file that ends with a message no bytes are cut",
+    (
+        "logs.dataflash.file",
+        "DataflashFile._successors",
+        "after = np.append(heads[1:], -1)[:inside]",
+        "without -",
+    ): "no message ends at byte 1",
+    (
+        "logs.dataflash.file",
+        "DataflashFile._successors",
+        "after = np.append(heads[1:], -1)[:inside]",
+        "1 → 2 #2",
+    ): "no message ends before the file",
+    (
+        "logs.dataflash.file",
+        "DataflashFile._last",
+        "if begun and (len(head) < HEAD_BYTES or first + sizes[head[2]] > self.size):",
+        "> → >=",
+    ): "a message that ends with the file is whole, and so is not what is left",
+    (
+        "logs.dataflash.orientation",
+        "from_roll_pitch_yaw",
+        "return np.where(np.abs(matrix - np.round(matrix)) < 1e-12, np.round(matrix), matrix)",
+        "< → <=",
+    ): RCOND,
+    (
+        "logs.dataflash.orientation",
+        "from_roll_pitch_yaw",
+        "return np.where(np.abs(matrix - np.round(matrix)) < 1e-12, np.round(matrix), matrix)",
+        "1e-12 → 1.1000000000000002e-12",
+    ): RCOND,
+    (
+        "logs.dataflash.parameters",
+        "Parameters.of",
+        "parameters._history = {name: [(0, value)] for name, value in values.items()}",
+        "0 → 1",
+    ): "the first value holds from the start",
+    (
+        "logs.dataflash.reader",
+        "DataflashLog._first",
+        "later = rows is not None and ANGLES[1][0] in rows",
+        "0 → 1",
+    ): "all three angles are there or none",
+    ("logs.dataflash.records", "", "DIFFERENT_TYPES = 256", "256 → 281"): "how many results are kept at hand",
+    ("logs.dataflash.signals", "", "PIECE_ROWS = 1 << 16", "1 → 2"): AT_A_TIME,
+    ("logs.dataflash.signals", "", "PIECE_ROWS = 1 << 16", "16 → 17"): AT_A_TIME,
+    (
+        "logs.dataflash.signals",
+        "vps",
+        't_ns = sampled_ns(t_ns, rows.integers("CTimeMS") * 1000, 64)',
+        "64 → 70",
+    ): "a counter as wide as the numbers does not wrap",
+    (
+        "logs.dataflash.signals",
+        "vps",
+        "attitude = from_euler(np.deg2rad(stream.vectors(next(n for n in ANGLES if n[0] in rows))))",
+        "0 → 1",
+    ): "all three angles are there or none",
+    (
+        "logs.dataflash.write",
+        "mag_messages",
+        "field_mg = np.trunc(np.round(np.asarray(magnetometer_g, float) * MILLIGAUSS_PER_GAUSS, 6))",
+        "6 → 7",
+    ): RCOND,
+    (
+        "logs.dataflash.write",
+        "as_logged",
+        "corrections = magnetometer_corrections(slot, held, np.zeros(1, np.int64), None)",
+        "1 → 2",
+    ): "the parameters hold all the time",
+    (
+        "logs.dataflash.write",
+        "as_logged",
+        "correction = inertial_corrections(sensor, slot, held, 0, at)[0]",
+        "0 → 1",
+    ): "the parameters hold all the time",
     (
         "logs.encodings.gather",
         "gather",

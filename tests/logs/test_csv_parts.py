@@ -269,6 +269,21 @@ def test_two_slashes_begin_a_comment_and_one_does_not() -> None:
     assert losses.counts == {ReasonCode.RAGGED_ROW: 3}
 
 
+@pytest.mark.parametrize("blank", ["", " ", "\t", " \t", "  "])
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_blank_lines_are_no_rows_wherever_they_stand(blank: str, place: int) -> None:
+    text = ["1,2,3", "4,5,6"]
+    cells, numbers, losses = rows("\n".join([*text[:place], blank, *text[place:], ""]))
+    assert cells == [("1", "3"), ("4", "6")]
+    assert numbers == [11 + (place == 0), 12 + (place < 2)]
+    assert losses.counts == {}
+
+
+def test_a_line_whose_quotes_do_not_close_is_no_row_of_one_column() -> None:
+    cells, numbers, losses = rows('1\n"2\n3\n', Dialect(",", ".", ("a",), b"a", None, 1), (0,))
+    assert (cells, numbers, losses.counts) == ([("1",), ("3",)], [11, 13], {ReasonCode.RAGGED_ROW: 1})
+
+
 def test_quotes_are_resolved_and_those_that_do_not_close_cost_their_row() -> None:
     cells, numbers, losses = rows('"1","2","3"\n4,"x, y",6\n"7,8,9\n10,"a""b",12\n1,"2"x,3\n')
     assert cells == [("1", "3"), ("4", "6"), ("10", "12")]
@@ -282,6 +297,7 @@ def test_blanks_as_separators_and_decimal_commas() -> None:
     comma = Dialect(";", ",", ("a", "b", "c"), b"a;b;c", None, 1)
     assert rows("1,5;2;3,25\n", comma)[0] == [("1.5", "3.25")]
     assert rows("# only\n")[:2] == ([], [])
+    assert rows("1,2,3\n4,5,6,\n", wanted=(0, 1, 2))[0] == [("1", "2", "3"), ("4", "5", "6")]
     assert rows("1,2,3\n4,5,6\n", wanted=(2, 0, 2))[0] == [("1", "3"), ("4", "6")]
     headless = Dialect(",", ".", ("a", "b", "c"), b"", None, 1)
     assert rows("a,b,c\n", headless)[0] == [("a", "c")]

@@ -7,6 +7,7 @@ from math import radians
 
 import numpy as np
 import pytest
+from dataflash_support import rows_of
 from pymavlink.dialects.v20 import ardupilotmega
 from pymavlink.rotmat import Matrix3
 
@@ -225,3 +226,53 @@ def test_names_of_slots() -> None:
     assert inertial_names("ACC", 1).thermal[2][0] == "INS_TCAL2_ACC3_X"
     assert [compass_names(slot).external for slot in (0, 1)] == ["COMPASS_EXTERNAL", "COMPASS_EXTERN2"]
     assert compass_names(2).off_diagonal == ("COMPASS_ODI3_X", "COMPASS_ODI3_Y", "COMPASS_ODI3_Z")
+
+
+def test_a_temperature_is_the_latest_and_a_step_is_more_than_a_degree() -> None:
+    t_ns, degc = np.arange(10, 80, 10), np.array([20.0, 21.0, np.nan, 21.5, 21.75, 20.5, 20.25])
+    assert Temperatures(t_ns, degc).steps() == [(10, 20.0), (40, 21.5), (70, 20.25)]
+    at = Temperatures(np.array([10, 20, 30]), np.array([1.0, np.nan, 3.0])).at
+    assert [at(t) for t in (5, 10, 29, 30, 99)] == [1.0, 1.0, 1.0, 3.0, 3.0]
+    assert np.isnan(NO_TEMPERATURE.at(5))
+    assert NO_TEMPERATURE.steps() == []
+
+
+@pytest.mark.parametrize("kind", ["GYR", "ACC", "MAG"])
+@pytest.mark.parametrize("missing", [None, 0, 1, 2])
+def test_where_an_offset_is_missing_the_log_does_not_say(kind: str, missing: int | None) -> None:
+    names = compass_names(0) if kind == "MAG" else inertial_names(kind, 0)
+    parameters = Parameters.of({name: 0.0 for i, name in enumerate(names.offset) if i != missing})
+    t_ns = np.array([5])
+    found = (
+        magnetometer_corrections(0, parameters, t_ns, None)
+        if kind == "MAG"
+        else inertial_corrections(kind, 0, parameters, 5, NO_TEMPERATURE)
+    )
+    assert [one.from_ns for one in found] == ([5] if missing is None else [])
+    assert [np.array(one.matrix).tolist() for one in found] == [np.eye(3).tolist()] * len(found)
+
+
+def test_offsets_in_the_messages_do_without_parameters() -> None:
+    none, t_ns, logged = Parameters(None, ()), np.array([5]), np.array([[10.0, 20.0, 30.0]])
+    (found,) = magnetometer_corrections(0, none, t_ns, logged)
+    assert np.allclose(found.offset, [0.01, 0.02, 0.03], rtol=1e-15)
+    assert magnetometer_corrections(0, none, t_ns[:0], logged[:0]) == ()
+    assert magnetometer_corrections(0, Parameters.of(dict.fromkeys(compass_names(0).offset, 1.0)), t_ns[:0], None) == ()
+
+
+@pytest.mark.parametrize(("stated", "offset"), [(10.0, 10.0), (10.9, 10.9), (11.0, 10.0), (9.1, 9.1), (9.0, 10.0)])
+def test_a_parameter_counts_within_what_was_cut_off(stated: float, offset: float) -> None:
+    """Of 10 in a message the parameter is between 9 and 11."""
+    parameters = Parameters.of(dict.fromkeys(compass_names(0).offset, stated))
+    (found,) = magnetometer_corrections(0, parameters, np.array([5]), np.full((1, 3), 10.0))
+    assert np.allclose(found.offset, offset * 1e-3, rtol=1e-15)
+
+
+def test_between_messages_the_last_ones_offsets_hold() -> None:
+    x, y, z = compass_names(0).offset
+    history = {"Name": [n.encode() for n in (x, y, z, "AHRS_ORIENTATION")] * 2, "Value": [0.0] * 7 + [4.0]}
+    parameters = Parameters(rows_of("PARM", "Nf", history), [0] * 4 + [25] * 4)
+    t_ns, logged = np.array([10, 20, 30]), np.array([[50.0, 0, 0], [60.0, 0, 0], [70.0, 0, 0]])
+    found = magnetometer_corrections(0, parameters, t_ns, logged)
+    assert [(one.from_ns, round(one.offset[0], 9)) for one in found] == [(10, 0.05), (20, 0.06), (25, 0.06), (30, 0.07)]
+    assert [one.matrix[0][0] for one in found] == [1.0, 1.0, -1.0, -1.0]

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dataflash_support import DataflashFlight, by_pymavlink
+from dataflash_support import PACK, DataflashFlight, by_pymavlink, fmt, own_fmt, rows_of
 
 from fieldcal.errors import UnreadableLog
 from fieldcal.logs.dataflash import file as dataflash_file
 from fieldcal.logs.dataflash.file import DataflashFile
-from fieldcal.logs.dataflash.records import LETTERS, multipliers, parse_fmt
+from fieldcal.logs.dataflash.records import FMT_LAYOUT, LETTERS, multipliers, parse_fmt
 
-FMT = struct.Struct("<3sBB4s16s64s")
 EXTREMES = {
     "b": (-128, 127),
     "B": (0, 255),
@@ -34,23 +33,6 @@ EXTREMES = {
     "d": (-1.5e300, 2.5),
     "g": (-1.5, 2.5),
 }
-PACK = {letter: letter for letter in "bBhHiIqQfd"} | {
-    "c": "h",
-    "C": "H",
-    "e": "i",
-    "E": "I",
-    "L": "i",
-    "M": "B",
-    "g": "e",
-}
-
-
-def fmt(type_id: int, size: int, name: str, letters: str, columns: str) -> bytes:
-    return FMT.pack(b"\xa3\x95\x80", type_id, size, name.encode(), letters.encode(), columns.encode())
-
-
-def own_fmt() -> bytes:
-    return fmt(128, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")
 
 
 def test_every_letter_reads_as_pymavlink_reads_it(tmp_path: Path) -> None:
@@ -100,6 +82,39 @@ def test_a_multiplier_applies_to_stored_integers_only(tmp_path: Path) -> None:
     assert np.array_equal(imu.in_unit("GyrX"), imu.stored("GyrX").astype(float))
 
 
+def test_whole_numbers_of_floats_are_cut_and_what_is_none_is_zero() -> None:
+    rows = rows_of("T", "dfh", {"A": [2.7, -2.7, np.nan, np.inf], "B": [-np.inf, 1e6, 0.9, -0.9], "C": [1, -1, 7, 9]})
+    assert rows.integers("A").tolist() == [2, -2, 0, 0]
+    assert rows.integers("B").tolist() == [0, 1_000_000, 0, 0]
+    assert rows.integers("C").tolist() == [1, -1, 7, 9]
+
+
+def test_of_no_messages_there_are_no_values() -> None:
+    rows = rows_of("T", "Qa", {"A": [1, 2], "B": [range(32)] * 2})
+    none = rows.where(np.zeros(2, bool))
+    assert (len(rows), len(none)) == (2, 0)
+    assert none.stored("A").shape == (0,)
+    assert none.stored("B").shape == (0, 32)
+    assert rows.where(np.array([False, True])).integers("A").tolist() == [2]
+
+
+def test_a_multiplier_is_the_logs_own_else_the_one_given() -> None:
+    rows = rows_of("T", "hfc", {"A": [5], "B": [5.0], "C": [500]}, multipliers={"A": 0.1, "B": 0.1, "C": 0.1})
+    assert [rows.in_unit(name, 1e-3).tolist() for name in "ABC"] == [[0.5], [5.0], [5.0]]
+    plain = rows_of("T", "hfc", {"A": [5], "B": [5.0], "C": [500]})
+    assert [plain.in_unit(name, 1e-3).tolist() for name in "ABC"] == [[0.005], [5.0], [5.0]]
+    assert plain.in_unit("A").tolist() == [5.0]
+
+
+def test_multipliers_of_zero_or_of_other_columns_are_none() -> None:
+    layouts = {130: rows_of("T", "Qbb", {"TimeUS": [], "V": [], "W": []}).layout}
+    mult = rows_of("MULT", "bd", {"Id": [ord("F"), ord("-"), ord("A")], "Mult": [1e-6, 0.0, 0.1]})
+    for ids, found in (("F-A", {"TimeUS": 1e-6, "W": 0.1}), ("FZA", {"TimeUS": 1e-6, "W": 0.1}), ("FA", None)):
+        fmtu = rows_of("FMTU", "BN", {"FmtType": [130, 131], "MultIds": [ids.encode(), b"F"]})
+        assert multipliers(fmtu, mult, layouts) == ({} if found is None else {130: found})
+        assert multipliers(fmtu, None, layouts) == multipliers(None, mult, layouts) == {}
+
+
 @pytest.mark.parametrize("missing", ["", "FmtType", "MultIds", "Id", "Mult"])
 def test_multipliers_need_every_column_of_both_messages(tmp_path: Path, missing: str) -> None:
     """Of FMTU types and letters, of MULT letters and factors: without one of them there is no multiplier."""
@@ -132,11 +147,20 @@ def test_multipliers_need_every_column_of_both_messages(tmp_path: Path, missing:
         (fmt(130, 2, "ABC", "Qb", "TimeUS,V"), None),
         (fmt(130, 12, "ABC", "Qb", "TimeUS,\xa3"), None),
         (fmt(130, 12, "ABC", "Qb", "TimeUS,V")[:-1], None),
+        (fmt(130, 3, "ABC", "", ""), ()),  # a head alone
+        (fmt(130, 12, "ABC", "Qb", "TimeUS,"), None),
+        (fmt(130, 12, "A_1", "Qb", "!,~"), ("!", "~")),  # the first and the last printable character
+        (fmt(130, 12, "ABC", "Qb", "TimeUS,V W"), None),
+        (fmt(130, 12, "ABC", "Qb", "TimeUS,\x7f"), None),
     ],
 )
 def test_definitions_that_contradict_themselves(message: bytes, columns: tuple[str, ...] | None) -> None:
     layout = parse_fmt(message)
     assert (None if layout is None else layout.columns) == columns
+
+
+def test_the_definition_of_definitions_is_the_one_that_logs_begin_with() -> None:
+    assert parse_fmt(own_fmt()) == FMT_LAYOUT
 
 
 def test_a_type_whose_length_is_wrong_is_stepped_over(tmp_path: Path) -> None:

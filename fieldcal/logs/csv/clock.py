@@ -118,9 +118,9 @@ class FileClock:
         interval = float(np.median(growing)) if growing.size else 0.0
         for period in self._known:
             pause = min(max(WRAP_SHARE * period, WRAP_INTERVALS * interval), self._pause)
-            if self._unit and period in (DAY_NS, WEEK_NS):
+            if period in (DAY_NS, WEEK_NS):
                 pause = CALENDAR_PAUSE_NS
-            slack = period / 2 if self._declared else pause
+            slack = period if self._declared else pause
             inside = (previous < period) & (t >= 0) & (step < -period // 2)
             turns = np.flatnonzero(inside & (step + period <= slack))
             if not turns.size:

@@ -38,7 +38,7 @@ def read_rows(
     silent = _silent(block, data, starts, ends, dialect, numbers, losses)
     damaged = np.zeros(len(ends), bool)
     damaged[np.searchsorted(ends, np.flatnonzero(data == 0))] = True
-    trailing = (fields == dialect.fields + 1) & (data[np.maximum(ends - 1, 0)] == ord(dialect.separator))
+    trailing = (fields == dialect.fields + 1) & (data[ends - 1] == ord(dialect.separator))
     ragged = (fields != dialect.fields) & ~trailing & ~silent & ~damaged
     losses.add(ReasonCode.NUL_BYTES, numbers[damaged & ~silent])
     losses.add(ReasonCode.RAGGED_ROW, numbers[ragged])

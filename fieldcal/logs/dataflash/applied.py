@@ -86,7 +86,7 @@ def inertial_corrections(
                 board, offset, scale, thermal, degc if thermal is not NO_THERMAL else THERMAL_REFERENCE_DEGC
             )
         warm = degc if thermal is not NO_THERMAL else None
-        found.append(_correction(at_ns, affine, parameters.held(used, at_ns), 1.0, warm))
+        found.append(_correction(at_ns, affine, parameters.held(used, at_ns), warm))
     return tuple(found)
 
 
@@ -116,12 +116,12 @@ def magnetometer_corrections(
             offset = offset if np.all(np.abs(offset - logged) < ROUNDED) else logged
         affine = magnetometer(
             mounting,
-            offset,
+            offset * GAUSS_PER_MILLIGAUSS,
             parameters.triple(names.diagonal, at_ns),
             parameters.triple(names.off_diagonal, at_ns),
             parameters.value(names.scale, at_ns),
         )
-        found.append(_correction(at_ns, affine, parameters.held(used, at_ns), GAUSS_PER_MILLIGAUSS, None))
+        found.append(_correction(at_ns, affine, parameters.held(used, at_ns), None))
     return tuple(found)
 
 
@@ -159,12 +159,12 @@ def _from(times_ns: set[int], first_ns: int) -> Sequence[int]:
 
 
 def _correction(
-    from_ns: int, affine: Affine, parameters: dict[str, float], unit: float, temperature_degc: float | None
+    from_ns: int, affine: Affine, parameters: dict[str, float], temperature_degc: float | None
 ) -> Correction:
     rows = [_triple(row) for row in affine.matrix]
     matrix: Rotation = (rows[0], rows[1], rows[2])
-    slope = _triple(affine.offset_per_degc * unit)
-    return Correction(from_ns, matrix, _triple(affine.offset * unit), parameters, temperature_degc, slope)
+    slope = _triple(affine.offset_per_degc)
+    return Correction(from_ns, matrix, _triple(affine.offset), parameters, temperature_degc, slope)
 
 
 def _triple(values: NDArray[np.float64]) -> Triple:

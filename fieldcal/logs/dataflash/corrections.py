@@ -71,13 +71,7 @@ class Thermal:
 NO_THERMAL = Thermal(np.zeros((3, 3)), THERMAL_REFERENCE_DEGC, THERMAL_REFERENCE_DEGC, THERMAL_REFERENCE_DEGC)
 
 
-def inertial(
-    board: Array,
-    offset: ArrayLike,
-    scale: ArrayLike = 1.0,
-    thermal: Thermal = NO_THERMAL,
-    temperature_degc: float = 35.0,
-) -> Affine:
+def inertial(board: Array, offset: ArrayLike, scale: ArrayLike, thermal: Thermal, temperature_degc: float) -> Affine:
     """Gyroscope or accelerometer. `board` (3, 3), `offset` (3,), `scale` (3,), 1 for gyroscopes."""
     scale = np.broadcast_to(np.asarray(scale, float), 3)
     matrix = board * scale
@@ -85,7 +79,7 @@ def inertial(
     return Affine(matrix, -matrix @ shift, -matrix @ thermal.slope(temperature_degc))
 
 
-def inertial_before_3_3(board: Array, offset: ArrayLike, scale: ArrayLike = 1.0) -> Affine:
+def inertial_before_3_3(board: Array, offset: ArrayLike, scale: ArrayLike) -> Affine:
     """The same as firmware before 3.3 did it."""
     scale = np.broadcast_to(np.asarray(scale, float), 3)
     return Affine(scale[:, None] * board, -np.asarray(offset, float), np.zeros(3))

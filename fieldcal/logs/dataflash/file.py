@@ -51,7 +51,7 @@ class Tally:
     undefined: Counter[int] = field(default_factory=Counter)
     stretches: int = 0
     damaged_bytes: int = 0
-    damaged_at: int = -1
+    damaged_at: int | None = None
     cut: int = 0
     redefined: Counter[str] = field(default_factory=Counter)
 
@@ -79,7 +79,7 @@ class DataflashFile:
         wanted = {i for i, layout in self.layouts.items() if layout.name in names or layout.name in SELF_DESCRIPTION}
         parts: dict[int, list[NDArray[np.int64]]] = {type_id: [] for type_id in wanted}
         for starts, types in self._walk():
-            counts = np.bincount(types, minlength=256)
+            counts = np.bincount(types)
             for type_id in np.flatnonzero(counts).tolist():
                 limit = self._redefined_at.get(type_id)
                 if type_id not in wanted and limit is None:
@@ -126,7 +126,7 @@ class DataflashFile:
             layout = parse_fmt(self._map[place : place + FMT_BYTES])
             if layout is not None and layout != self.layouts.setdefault(layout.type_id, layout):
                 self._redefined_at.setdefault(layout.type_id, place)
-            place = self._map.find(head, place + (1 if layout is None else FMT_BYTES))
+            place = self._map.find(head, place + (HEAD_BYTES if layout is None else FMT_BYTES))
         if len(self.layouts) == 1:
             raise UnreadableLog(
                 ReasonCode.NOT_AN_AUTOPILOT_LOG,
@@ -150,7 +150,7 @@ class DataflashFile:
             ends = heads + sizes[types]
             inside = int(np.searchsorted(heads, stop))
             follows, fits = self._successors(heads, ends, inside)
-            fits &= sizes[types[:inside]] > 0
+            fits &= sizes[types[:inside]].astype(bool)
             good = np.flatnonzero(fits)
             places = heads[good]
             # A run of messages ends at one that the next head does not follow: it is damaged, or looks like a head
@@ -181,7 +181,7 @@ class DataflashFile:
         follows = after == ends[:inside]
         fits = follows.copy()
         rest = np.flatnonzero(~follows)
-        places = np.minimum(np.searchsorted(heads, ends[rest]), max(len(heads) - 1, 0))
+        places = np.minimum(np.searchsorted(heads, ends[rest]), len(heads) - 1)
         fits[rest] = (heads[places] == ends[rest]) | (ends[rest] == self.size)
         for missing in (1, 2):  # a head that the file ends within
             begun = self.content[self.size - missing :].tobytes() == MARK[:missing]
@@ -202,7 +202,7 @@ class DataflashFile:
     def _last(self, first: int, sizes: NDArray[np.int64]) -> None:
         """Account for the file's end behind its last whole message."""
         head = self.content[first : first + HEAD_BYTES].tobytes()
-        begun = MARK.startswith(head[:2]) if len(head) < HEAD_BYTES else head[:2] == MARK
+        begun = MARK.startswith(head[:2])
         if begun and (len(head) < HEAD_BYTES or first + sizes[head[2]] > self.size):
             self.tally.cut = self.size - first
         else:

@@ -68,7 +68,7 @@ class Layout:
     size: int
     letters: str
     columns: tuple[str, ...]
-    offsets: tuple[int, ...] = field(repr=False)
+    offsets: tuple[int, ...]
 
     def letter(self, column: str) -> Letter:
         """How a column is stored. Raises ValueError where there is none of this name."""
@@ -120,8 +120,8 @@ class Rows:
     """
 
     layout: Layout
-    content: NDArray[np.uint8] = field(repr=False)
-    starts: NDArray[np.int64] = field(repr=False)
+    content: NDArray[np.uint8]
+    starts: NDArray[np.int64]
     multipliers: Mapping[str, float] = field(default_factory=dict)
 
     def __len__(self) -> int:

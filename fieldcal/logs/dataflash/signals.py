@@ -144,7 +144,7 @@ def velocity(gps: Stream, accuracy: Stream | None) -> Columns:
     if accuracy is not None and len(accuracy.t_ns):
         order = np.argsort(accuracy.t_ns, kind="stable")
         t_ns, sd = accuracy.t_ns[order], accuracy.rows.numbers("SAcc")[order]
-        after = np.clip(np.searchsorted(t_ns, gps.t_ns), 0, len(t_ns) - 1)
+        after = np.minimum(np.searchsorted(t_ns, gps.t_ns), len(t_ns) - 1)
         before = np.maximum(after - 1, 0)
         nearest = np.where(np.abs(t_ns[after] - gps.t_ns) <= np.abs(t_ns[before] - gps.t_ns), after, before)
         near = np.abs(t_ns[nearest] - gps.t_ns) <= NEAREST_ACCURACY_NS

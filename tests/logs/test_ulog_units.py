@@ -1,0 +1,476 @@
+"""Readings, units and what else PX4 logs, small cases at their limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fieldcal.logs.ulog import aids, streams, units
+from fieldcal.logs.ulog.file import Change, UlogFile
+from fieldcal.logs.ulog.parameters import History, parameters_of, slot_of
+from fieldcal.logs.ulog.records import Topic
+from fieldcal.logs.ulog.rotations import FIRST_OF_MAVLINK, rotation
+from fieldcal.logs.ulog.streams import Clock
+from fieldcal.logs.ulog.units import Selection, longest
+from fieldcal.logs.ulog.write import Rows, write_ulog
+from fieldcal.names import Sensor
+
+LATEST = 4 * 10**15
+
+
+def log_of(path: Path, *topics: Rows, **options: Any) -> UlogFile:
+    write_ulog(path, topics, **options)
+    return UlogFile(path)
+
+
+def rows_of(file: UlogFile, name: str, instance: int = 0) -> tuple[Topic, Any]:
+    topic = next(one for one in file.topics if (one.name, one.instance) == (name, instance))
+    return topic, file.rows(topic)
+
+
+def stamps(*t_us: int) -> np.ndarray:
+    return np.array(t_us, np.uint64)
+
+
+def numbers(kind: type[np.generic], *values: float) -> np.ndarray:
+    return np.array(values).astype(kind)
+
+
+def triples(n: int) -> np.ndarray:
+    return np.arange(3 * n, dtype=np.float32).reshape(n, 3)
+
+
+def imu_topic(name: str, device_id: int, hz: float, instance: int = 0, n: int = 40) -> Rows:
+    """A topic of three axes at a rate."""
+    t_us = np.arange(n, dtype=np.float64) * 1e6 / hz + 1000
+    axes = {axis: np.full(n, i, np.float32) for i, axis in enumerate("xyz")}
+    return Rows(
+        name, {"timestamp": t_us.astype(np.uint64), "device_id": np.full(n, device_id, np.uint32), **axes}, instance
+    )
+
+
+# streams -------------------------------------------------------------------------------------------------------------
+
+
+def test_stamps_are_cut_where_no_boot_clock_reaches() -> None:
+    assert Clock(7).ns(np.array([0, 5, LATEST, LATEST + 1, 2**64 - 1], np.uint64)).tolist() == [
+        7, 5007, *[LATEST * 1000 + 7] * 3
+    ]  # fmt: skip
+    assert Clock().ns(np.array([-1, 0])).tolist() == [0, 0]
+
+
+def test_a_time_of_sampling_goes_before_that_of_logging(tmp_path: Path) -> None:
+    both = {"timestamp": stamps(10, 20, 30), "timestamp_sample": stamps(9, 0, 1)}
+    other = {"timestamp": stamps(10, 20, 30), "timestamp_sample": numbers(np.float32, 9, 8, 7)}
+    file = log_of(tmp_path / "a.ulg", Rows("a", both), Rows("b", other), Rows("c", {"timestamp": stamps(10)}))
+    assert streams.stamps_us(rows_of(file, "a")[1]).tolist() == [9, 20, 1]
+    assert streams.stamps_us(rows_of(file, "b")[1]).tolist() == [10, 20, 30]
+    assert streams.stamps_us(rows_of(file, "c")[1]).tolist() == [10]
+
+
+def test_fields_of_numbers(tmp_path: Path) -> None:
+    columns = {"timestamp": stamps(1), "a": triples(1), "b": numbers(np.int8, 1)}
+    topic, _ = rows_of(log_of(tmp_path / "a.ulg", Rows("a", columns)), "a")
+    assert streams.has(topic, "timestamp", "b")
+    assert streams.has(topic, "a", shape=(3,))
+    assert not streams.has(topic, "a")
+    assert not streams.has(topic, "b", "c")
+    assert not streams.has(topic, "b", shape=(3,))
+    assert streams.has(topic)
+
+
+@pytest.mark.parametrize(
+    ("t_us", "rate"), [((), 0), ((5,), 0), ((5, 5), 0), ((0, 20_000), 50), ((0, 1), 10**6), ((0, 10, 20, 90), 10**5)]
+)
+@pytest.mark.filterwarnings("error")
+def test_rates(tmp_path: Path, t_us: tuple[int, ...], rate: float) -> None:
+    fifo = {"timestamp": stamps(*t_us), "samples": np.full(len(t_us), 8, np.uint8)}
+    file = log_of(tmp_path / "a.ulg", Rows("a", {"timestamp": stamps(*t_us)}), Rows("sensor_gyro_fifo", fifo))
+    if len(t_us):
+        assert streams.rate_hz(file, file.topics[1]) == 8 * rate
+    assert streams.rate_hz(file, file.topics[0]) == rate
+
+
+def test_samples_of_a_fifo_lie_before_its_stamp(tmp_path: Path) -> None:
+    """Four places; a message says how many are filled, how far apart, and what a count is."""
+    counts = numbers(np.int16, *range(12)).reshape(3, 4)
+    columns = {
+        "timestamp": stamps(10**6, 2 * 10**6, 3 * 10**8),
+        "dt": numbers(np.float32, 125.5, np.nan, 1.2e7),
+        "scale": numbers(np.float32, 0.5, 2.0, 1.0),
+        "samples": numbers(np.uint8, 3, 9, 2),
+        **{axis: counts + 100 * i for i, axis in enumerate("xyz")},
+    }
+    topic, rows = rows_of(log_of(tmp_path / "a.ulg", Rows("sensor_gyro_fifo", columns)), "sensor_gyro_fifo")
+    t_ns, values = streams.readings(rows, topic, Clock(1))
+    first = [10**9 - 251_000 + 1, 10**9 - 125_500 + 1, 10**9 + 1]
+    assert t_ns.tolist() == [*first, *[2 * 10**9 + 1] * 4, 3 * 10**11 - 10**10 + 1, 3 * 10**11 + 1]
+    assert values[:, 0].tolist() == [0.0, 0.5, 1.0, 8.0, 10.0, 12.0, 14.0, 8.0, 9.0]
+    assert values[:, 2].tolist() == [100.0, 100.5, 101.0, 408.0, 410.0, 412.0, 414.0, 208.0, 209.0]
+
+
+@pytest.mark.parametrize("at_once", [1, 2, 3, 7, 1000])
+@pytest.mark.parametrize("order", [1, -1])
+def test_sensors_apart_are_joined_whatever_the_chunks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int, order: int
+) -> None:
+    monkeypatch.setattr(streams, "ROWS_AT_ONCE", at_once)
+    gyro_us, accel_us = np.arange(1000, 1400, 7), np.arange(990, 1500, 10)[::order]
+    parts = [
+        Rows(name, {"timestamp": t_us.astype(np.uint64), **{axis: t_us.astype(np.float32) * (1 + i) for i, axis in enumerate("xyz")}})
+        for name, t_us in (("sensor_gyro", gyro_us), ("sensor_accel", accel_us))
+    ]  # fmt: skip
+    path = tmp_path / "a.ulg"
+    write_ulog(path, parts)
+    if order < 0:  # the writer sorts by time; here two rows change places
+        content = path.read_bytes()
+        low, high = (int(t).to_bytes(8, "little") for t in (1190, 1200))
+        path.write_bytes(content.replace(low, b"\xff" * 8).replace(high, low).replace(b"\xff" * 8, high))
+    file = UlogFile(path)
+    found = list(streams.joined(file, rows_of(file, "sensor_gyro")[0], rows_of(file, "sensor_accel")[0], Clock()))
+    t_ns = np.concatenate([one.columns["t_ns"] for one in found])
+    assert t_ns.tolist() == (gyro_us * 1000).tolist()
+    if order > 0:
+        accel = np.concatenate([one.columns["accelerometer_y"] for one in found])
+        assert np.allclose(accel, 2 * gyro_us, rtol=1e-6)
+    assert sum(one.left_out + one.outside for one in found) == 0
+
+
+def test_rows_of_sensor_combined(tmp_path: Path) -> None:
+    columns = {
+        "timestamp": stamps(1000, 2000, 3000, 4000),
+        "gyro_rad": triples(4),
+        "accelerometer_m_s2": triples(4) + 100,
+        "accelerometer_timestamp_relative": numbers(np.int32, 0, 2**31 - 1, 0, 0),
+    }
+    _, rows = rows_of(log_of(tmp_path / "a.ulg", Rows("sensor_combined", columns)), "sensor_combined")
+    found = streams.combined(rows, Clock(5)).columns
+    assert found["t_ns"].tolist() == [1_000_005, 2_000_005, 3_000_005, 4_000_005]
+    assert found["gyroscope_z"].tolist() == [2.0, 5.0, 8.0, 11.0]
+    assert np.array_equal(found["accelerometer_x"], [100.0, np.nan, 106.0, 109.0], equal_nan=True)
+
+
+def test_a_reading_that_is_held_counts_once(tmp_path: Path) -> None:
+    columns = {
+        "timestamp": stamps(100, 200, 300, 400, 500),
+        "magnetometer_ga": triples(5),
+        "magnetometer_timestamp_relative": numbers(np.int32, 0, -100, 2**31 - 1, -10, -110),
+    }
+    topic, rows = rows_of(log_of(tmp_path / "a.ulg", Rows("sensor_combined", columns)), "sensor_combined")
+    t_ns, values, last = streams.combined_magnetometer(rows, Clock(5), -1)
+    assert (t_ns.tolist(), values[:, 0].tolist(), last) == ([100_005, 390_005], [0.0, 9.0], 390)
+    t_ns, _, last = streams.combined_magnetometer(rows[:2], Clock(), 100)
+    assert (t_ns.tolist(), last) == ([], 100)
+    assert topic.instance == 0
+
+
+def test_means_over_intervals(tmp_path: Path) -> None:
+    columns = {
+        "timestamp": stamps(1000, 2000),
+        "delta_angle": triples(2),
+        "delta_velocity": triples(2) + 1,
+        "delta_angle_dt": numbers(np.uint16, 2000, 4000),
+        "delta_velocity_dt": numbers(np.uint16, 5000, 0),
+    }
+    _, rows = rows_of(log_of(tmp_path / "a.ulg", Rows("vehicle_imu", columns)), "vehicle_imu")
+    t_ns, rate, force = streams.averaged(rows, Clock())
+    assert t_ns.tolist() == [10**6, 2 * 10**6]
+    assert np.allclose(rate, [[0, 500, 1000], [750, 1000, 1250]])
+    assert np.allclose(force[0], [200, 400, 600])
+    assert not np.isfinite(force[1]).any()
+
+
+# units ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("chosen", "end_us", "found"),
+    [
+        ([], 100, None),
+        ([Selection(0, 1, 2)], 100, 0),
+        ([Selection(0, 1, 2), Selection(40, 3, 4)], 100, 1),
+        ([Selection(0, 1, 2), Selection(50, 3, 4)], 100, 0),  # as long: the first
+        ([Selection(0, 1, 2), Selection(30, 3, 4), Selection(70, 1, 2)], 100, 0),
+        ([Selection(0, 1, 2), Selection(30, 1, 4), Selection(90, 1, 2)], 100, 1),
+        ([Selection(0, 1, 2), Selection(90, 3, 4)], 80, 0),  # times that do not grow
+    ],
+)
+def test_the_unit_chosen_for_the_longest_time(chosen: list[Selection], end_us: int, found: int | None) -> None:
+    assert longest(chosen, end_us) == (None if found is None else chosen[found])
+
+
+def test_choices_in_order_without_repetitions(tmp_path: Path) -> None:
+    rows = [(5, 1, 2), (6, 1, 2), (7, 1, 3), (8, 4, 3), (LATEST + 9, 1, 2)]
+    columns = {
+        "timestamp": stamps(*(t for t, *_ in rows)),
+        "gyro_device_id": numbers(np.uint32, *(g for _, g, _ in rows)),
+        "accel_device_id": numbers(np.uint32, *(a for *_, a in rows)),
+    }
+    other = {"timestamp": stamps(1), "gyro_device_id": numbers(np.uint32, 9), "accel_device_id": numbers(np.uint32, 9)}
+    file = log_of(tmp_path / "a.ulg", Rows("sensor_selection", columns), Rows("sensor_selection", other, 1))
+    assert units.selections(file) == [
+        Selection(5, 1, 2), Selection(7, 1, 3), Selection(8, 4, 3), Selection(LATEST, 1, 2)
+    ]  # fmt: skip
+    lacks = Rows("sensor_selection", {"timestamp": stamps(1), "gyro_device_id": numbers(np.uint32, 9)})
+    assert units.selections(log_of(tmp_path / "b.ulg", lacks)) == []
+
+
+@pytest.mark.parametrize(("raw_hz", "name"), [(50.0, "sensor_gyro.0 and sensor_accel.0"), (49.9, "vehicle_imu.0")])
+def test_rawer_readings_are_preferred_down_to_a_rate(tmp_path: Path, raw_hz: float, name: str) -> None:
+    n = 200
+    averaged = {
+        "timestamp": (np.arange(n) * 5000 + 1000).astype(np.uint64),
+        "gyro_device_id": np.full(n, 7, np.uint32),
+        "accel_device_id": np.full(n, 8, np.uint32),
+        **{f"delta_{what}": triples(n) for what in ("angle", "velocity")},
+        **{f"delta_{what}_dt": np.full(n, 5000, np.uint16) for what in ("angle", "velocity")},
+    }
+    raw = [imu_topic("sensor_gyro", 7, raw_hz), imu_topic("sensor_accel", 8, 100.0)]
+    (unit,) = units.imus(log_of(tmp_path / "a.ulg", *raw, Rows("vehicle_imu", averaged)))
+    assert (unit.stream.name, unit.device_id, unit.accelerometer_id, unit.primary) == (name, 7, 8, True)
+    slow = [imu_topic("sensor_gyro", 7, 20.0), imu_topic("sensor_accel", 8, 10.0)]
+    (unit,) = units.imus(log_of(tmp_path / "b.ulg", *slow))
+    assert unit.stream.rate_hz == 10.0
+
+
+def test_sensors_are_paired_by_instance(tmp_path: Path) -> None:
+    topics = [imu_topic("sensor_gyro", 7, 200.0), imu_topic("sensor_gyro", 9, 200.0, 1)]
+    topics += [imu_topic("sensor_accel", 8, 200.0), imu_topic("sensor_accel", 10, 200.0, 1)]
+    chosen = {
+        "timestamp": stamps(1),
+        "gyro_device_id": numbers(np.uint32, 9),
+        "accel_device_id": numbers(np.uint32, 10),
+    }
+    found = units.imus(log_of(tmp_path / "a.ulg", *topics, Rows("sensor_selection", chosen)))
+    assert [(u.device_id, u.accelerometer_id, u.primary) for u in found] == [(9, 10, True), (7, 8, False)]
+    found = units.imus(log_of(tmp_path / "b.ulg", *topics))
+    assert [(u.device_id, u.accelerometer_id, u.primary) for u in found] == [(7, 8, True), (9, 10, False)]
+    found = units.imus(log_of(tmp_path / "c.ulg", *topics[:1], *topics[3:]))  # no mate of its instance
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    ("parameters", "order"),
+    [
+        ({}, [7, 9]),
+        ({"CAL_MAG0_ID": 9, "CAL_MAG0_PRIO": 75, "CAL_MAG1_ID": 7, "CAL_MAG1_PRIO": 50}, [9, 7]),
+        ({"CAL_MAG3_ID": 9, "CAL_MAG3_PRIO": 75}, [9, 7]),
+        ({"CAL_MAG4_ID": 9, "CAL_MAG4_PRIO": 75}, [7, 9]),
+        ({"CAL_MAG0_ID": 9}, [7, 9]),
+        ({"CAL_MAG0_ID": 9, "CAL_MAG0_PRIO": 50, "CAL_MAG1_ID": 7, "CAL_MAG1_PRIO": 50}, [7, 9]),
+    ],
+)
+def test_the_magnetometer_of_the_highest_priority_is_the_primary_one(
+    tmp_path: Path, parameters: Mapping[str, float], order: list[int]
+) -> None:
+    file = log_of(tmp_path / "a.ulg", imu_topic("sensor_mag", 7, 20.0), imu_topic("sensor_mag", 9, 20.0, 1))
+    found = units.magnetometers(file, parameters)
+    assert [(u.device_id, u.accelerometer_id, u.primary) for u in found] == [(order[0], 0, True), (order[1], 0, False)]
+
+
+@pytest.mark.parametrize(("ids", "count"), [((7, 9), 2), ((7, 7), 2), ((0, 0), 2), ((7, 7, 7), 3)])
+def test_magnetometers_of_one_id_are_units_of_their_own(tmp_path: Path, ids: tuple[int, ...], count: int) -> None:
+    topics = [imu_topic("sensor_mag", number, 20.0, i) for i, number in enumerate(ids)]
+    found = units.magnetometers(log_of(tmp_path / "a.ulg", *topics), {})
+    assert sorted(unit.stream.topic.instance for unit in found) == list(range(count))
+
+
+@pytest.mark.parametrize(("raw_hz", "name"), [(5.0, "sensor_mag.0"), (4.9, "vehicle_magnetometer.0")])
+def test_a_raw_magnetometer_is_preferred_down_to_a_rate(tmp_path: Path, raw_hz: float, name: str) -> None:
+    n = 40
+    calibrated = {
+        "timestamp": (np.arange(n) * 100_000 + 1000).astype(np.uint64),
+        "device_id": np.full(n, 7, np.uint32),
+        "magnetometer_ga": triples(n),
+    }
+    topics = imu_topic("sensor_mag", 7, raw_hz), Rows("vehicle_magnetometer", calibrated)
+    (unit,) = units.magnetometers(log_of(tmp_path / "a.ulg", *topics), {})
+    assert (unit.stream.name, unit.primary) == (name, True)
+
+
+def test_a_magnetometer_held_in_sensor_combined(tmp_path: Path) -> None:
+    for relatives, rate in (((0, -10_000, 0, -10_000), 50.0), ((0, -10_000), 0.0)):
+        n = len(relatives)
+        columns = {
+            "timestamp": stamps(*(10_000 * i + 10_000 for i in range(n))),
+            "magnetometer_ga": triples(n),
+            "magnetometer_timestamp_relative": numbers(np.int32, *relatives),
+        }
+        (unit,) = units.magnetometers(log_of(tmp_path / "a.ulg", Rows("sensor_combined", columns)), {})
+        assert (unit.device_id, unit.stream.rate_hz, unit.primary) == (0, rate, True)
+
+
+def test_ids_of_a_topic(tmp_path: Path) -> None:
+    columns = {"timestamp": stamps(1, 2, 3), "device_id": numbers(np.uint32, 5, 6, 6)}
+    file = log_of(tmp_path / "a.ulg", Rows("a", columns), Rows("b", {"timestamp": stamps(1)}))
+    assert (units.first_id(file, file.topics[0]), units.usual_id(file, file.topics[0])) == (5, 6)
+    assert (units.first_id(file, file.topics[1]), units.usual_id(file, file.topics[1])) == (0, 0)
+
+
+# what else is logged -------------------------------------------------------------------------------------------------
+
+YEAR_2001_US = 10**15
+
+
+@pytest.mark.parametrize(
+    ("fix", "boot_us", "utc_us", "known"),
+    [
+        (3, 100, YEAR_2001_US + 1, True),
+        (2, 100, YEAR_2001_US + 1, False),
+        (3, 100, YEAR_2001_US, False),
+        (3, 100, LATEST - 1, True),
+        (3, 100, LATEST, False),
+        (3, 0, YEAR_2001_US + 1, True),
+        (3, LATEST - 1, YEAR_2001_US + 1, True),
+        (3, LATEST, YEAR_2001_US + 1, False),
+    ],
+)
+def test_the_date_by_a_fix(tmp_path: Path, fix: int, boot_us: int, utc_us: int, known: bool) -> None:
+    columns = {
+        "timestamp": stamps(boot_us),
+        "time_utc_usec": stamps(utc_us),
+        "fix_type": numbers(np.uint8, fix),
+    }
+    found = aids.epoch(log_of(tmp_path / "a.ulg", Rows("sensor_gps", columns)))
+    assert (None if found is None else found.offset_ns) == ((utc_us - boot_us) * 1000 if known else None)
+
+
+@pytest.mark.parametrize(
+    ("noted", "known"),
+    [(YEAR_2001_US, False), (YEAR_2001_US + 1, True), (LATEST - 1, True), (LATEST, False)],
+)
+def test_the_date_by_the_loggers_note(tmp_path: Path, noted: int, known: bool) -> None:
+    file = log_of(tmp_path / "a.ulg", Rows("a", {"timestamp": stamps(1)}), infos={"boot_time_utc_us": noted})
+    found = aids.epoch(file)
+    assert (None if found is None else found.offset_ns) == (noted * 1000 if known else None)
+
+
+def test_velocities_count_where_they_are_valid(tmp_path: Path) -> None:
+    columns = {
+        "timestamp": stamps(1, 2, 3),
+        "fix_type": numbers(np.uint8, 2, 3, 4),
+        "lat": numbers(np.int32, 1, 471_234_567, 2),
+        "lon": numbers(np.int32, 1, 81_234_567, 2),
+        "alt": numbers(np.int32, 1, 430_250, 2),
+        **{name: triples(3)[:, i] for i, name in enumerate(("vel_n_m_s", "vel_e_m_s", "vel_d_m_s"))},
+        "vel_ned_valid": numbers(np.uint8, 1, 0, 1),
+        "s_variance_m_s": numbers(np.float32, 1, 2, 4),
+    }
+    file = log_of(tmp_path / "a.ulg", Rows("vehicle_gps_position", columns))
+    found = dict(aids.gnss_batches(file, Clock(3)))
+    assert found["position"]["t_ns"].tolist() == [2003, 3003]
+    place = [found["position"][name][0] for name in ("latitude_deg", "longitude_deg", "altitude_m")]
+    assert np.allclose(place, [47.1234567, 8.1234567, 430.25], rtol=1e-12)
+    velocity = found["gnss_velocity"]
+    assert [velocity[name].tolist() for name in velocity] == [[3003], [6.0], [7.0], [8.0], [4.0]]
+
+
+@pytest.mark.parametrize(("field", "usable"), [("local_frame", (0, 1)), ("pose_frame", (1, 2))])
+def test_frames_of_poses_whose_z_is_down(tmp_path: Path, field: str, usable: tuple[int, ...]) -> None:
+    q = np.arange(16, dtype=np.float32).reshape(4, 4)
+    q[3, 0] = np.nan
+    columns = {"timestamp": stamps(1, 2, 3, 4), "q": q, "position": triples(4), field: numbers(np.uint8, 0, 1, 2, 1)}
+    topic, rows = rows_of(
+        log_of(tmp_path / "a.ulg", Rows("vehicle_visual_odometry", columns)), "vehicle_visual_odometry"
+    )
+    found, unusable = aids.pose_columns(topic, rows, Clock())
+    assert unusable == 1
+    assert found["t_ns"].tolist() == [1000 * (i + 1) for i in usable]
+    assert [[found[f"q{axis}"][i] for axis in "wxyz"] for i in (0, 1)] == [q[i].tolist() for i in usable]
+    assert found["pz_m"].tolist() == [3.0 * i + 2 for i in usable]
+
+
+def test_the_pose_with_the_most_messages(tmp_path: Path) -> None:
+    def pose(name: str, n: int, width: int = 4) -> Rows:
+        return Rows(name, {"timestamp": stamps(*range(n)), "q": np.ones((n, width), np.float32)})
+
+    mocap, visual = pose("vehicle_mocap_odometry", 2), pose("vehicle_visual_odometry", 3)
+    for topics, name in (((mocap, visual), visual.topic), ((mocap,), mocap.topic), ((pose(visual.topic, 3, 3),), None)):
+        found = aids.pose_topic(log_of(tmp_path / "a.ulg", *topics))
+        assert (None if found is None else found.name) == name
+
+
+def test_temperatures_by_the_sensors_of_the_unit_first(tmp_path: Path) -> None:
+    def sensor(name: str, device_id: int, degc: float, instance: int = 0) -> Rows:
+        columns = {"timestamp": stamps(1, 2), "device_id": numbers(np.uint32, device_id, device_id)}
+        return Rows(name, columns | {"temperature": numbers(np.float32, degc, np.nan)}, instance)
+
+    status = {"timestamp": stamps(5), "accel_device_id": numbers(np.uint32, 8), "gyro_device_id": numbers(np.uint32, 7)}
+    status |= {"temperature_accel": numbers(np.float32, 30), "temperature_gyro": numbers(np.float32, 40)}
+    fitting = [sensor("sensor_accel", 8, 10), sensor("sensor_gyro", 7, 20), Rows("vehicle_imu_status", status)]
+    for number, degc in enumerate((10.0, 20.0, 30.0)):
+        file = log_of(tmp_path / "a.ulg", sensor("sensor_accel", 9, 50, 1), *fitting[number:])
+        unit = units.Unit(7, 8, units.Stream(file.topics[0], 1.0), True)
+        found = aids.temperature(file, unit, Clock())
+        assert found is not None
+        assert found["temperature_degc"].tolist() == [degc]
+    assert aids.temperature(log_of(tmp_path / "b.ulg", sensor("sensor_accel", 8, np.nan)), unit, Clock()) is None
+
+
+def test_currents_are_not_negative(tmp_path: Path) -> None:
+    battery = {"timestamp": stamps(1, 2, 3), "current_a": numbers(np.float32, -1, 0, 5)}
+    found = aids.current(log_of(tmp_path / "a.ulg", Rows("battery_status", battery)), Clock())
+    assert found is not None
+    assert (found["t_ns"].tolist(), found["current_a"].tolist()) == ([2000, 3000], [0.0, 5.0])
+    none = {"timestamp": stamps(1), "current_a": numbers(np.float32, -1)}
+    assert aids.current(log_of(tmp_path / "b.ulg", Rows("battery_status", none)), Clock()) is None
+
+
+# parameters ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("values", "device_id", "slot"),
+    [
+        ({"CAL_ACC0_ID": 7, "CAL_ACC1_ID": 8}, 8, 1),
+        ({"CAL_ACC3_ID": 8}, 8, 3),
+        ({"CAL_ACC4_ID": 8}, 8, None),
+        ({"CAL_ACC0_ID": 0}, 0, None),
+        ({"CAL_ACC0_ID": -1}, 2**32 - 1, 0),
+        ({"CAL_ACC0_ID": -(2**31)}, 2**31, 0),
+        ({"CAL_ACC0_ID": np.nan, "CAL_ACC1_ID": 8}, 8, 1),
+    ],
+)
+def test_the_slot_of_a_device(values: Mapping[str, float], device_id: int, slot: int | None) -> None:
+    assert slot_of("CAL_ACC", device_id, values) == slot
+
+
+def test_states_begin_with_the_log_and_with_what_was_set_of_it() -> None:
+    changes = [Change(5, "A_X", 1.0), Change(5, "A_Y", 2.0), Change(6, "B_X", 3.0), Change(7, "A_X", 4.0)]
+    history = History({"A_X": 0.0}, changes, 3)
+    assert list(history.states("A_")) == [
+        (3, {"A_X": 0.0}),
+        (5, {"A_X": 1.0, "A_Y": 2.0}),
+        (7, {"A_X": 4.0, "A_Y": 2.0, "B_X": 3.0}),
+    ]
+    assert [at for at, _ in history.states("A_", "B_")] == [3, 5, 6, 7]
+    assert history.last == {"A_X": 4.0, "A_Y": 2.0, "B_X": 3.0}
+    assert (History({}).start_us, History({}).release) == (0, None)
+
+
+def test_parameters_of_a_sensor_are_those_that_there_are() -> None:
+    values = {"CAL_GYRO0_ID": 5.0, "CAL_GYRO3_ID": 6.0, "TC_G0_ID": np.nan, "TC_G_ENABLE": 1.0, "IMU_GYRO_CAL_EN": 0.0}
+    found = parameters_of(Sensor.GYROSCOPE, 5, values | {"OTHER": 1.0, "CAL_GYRO0_XOFF": 0.25})
+    wanted = {
+        "CAL_GYRO0_ID": 5.0,
+        "CAL_GYRO3_ID": 6.0,
+        "TC_G_ENABLE": 1.0,
+        "IMU_GYRO_CAL_EN": 0.0,
+        "CAL_GYRO0_XOFF": 0.25,
+    }
+    assert found == wanted
+
+
+def test_rotations_end_with_their_table_and_are_mavlinks_from_a_release_on() -> None:
+    for release in (None, FIRST_OF_MAVLINK, FIRST_OF_MAVLINK - 1):
+        turned = [not np.array_equal(rotation(number, release), np.eye(3)) for number in range(-1, 60)]
+        last = max(np.flatnonzero(turned)) - 1
+        assert turned[:3] == [False, False, True]
+        assert all(turned[2 : last + 2])
+    assert FIRST_OF_MAVLINK == 1 << 24 | 12 << 16
+    assert np.array_equal(rotation(30, FIRST_OF_MAVLINK), rotation(30))
+    assert not np.array_equal(rotation(30, FIRST_OF_MAVLINK - 1), rotation(30))
