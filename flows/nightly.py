@@ -11,11 +11,10 @@ from typing import Any, cast
 from prefect import Flow, State, flow
 from prefect.states import Failed
 
-from fieldcal.batch.closing import close_night
 from fieldcal.batch.documents import Answer, Batch, NightDocument, PlainOutcome
 from fieldcal.batch.elsewhere.work import is_far, work
+from fieldcal.batch.ending import end_night
 from fieldcal.batch.flights import lost
-from fieldcal.batch.ledgers.room import make_room
 from fieldcal.batch.night import Night, Watcher, plan_night, publishings
 from fieldcal.batch.outcome import Outcome
 from fieldcal.batch.telling import telling
@@ -34,7 +33,6 @@ from fieldcal.names import Status
 from fieldcal.provenance.run_key import code_digest
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.remote.places import archive_at, session_at
-from fieldcal.report.fitness import Criteria
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.words.printable import printable
@@ -159,14 +157,7 @@ def carry_out(
         outcomes += _calibrate(night, parallel, watcher, processes)
         for publishing in publishings(night, outcomes):
             publish_as_task(publishing)
-        night.remember(outcomes)
-        with_site = night.configuration.writes_site
-        closing = close_night(
-            night.root, Criteria.of(night.configuration), with_site=with_site, workers=parallel.here()
-        )
-        if outcomes:
-            make_room(night)
-        result = night.document(outcomes, closing)
+        result, closing = end_night(night, outcomes, parallel.here())
         keep_artifact(result, night.root)
         tell_prefect(closing.changes)
         tell(result)

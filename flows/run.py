@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from fieldcal.batch.documents import NightDocument, PlanDocument, PlannedLog, UnreadEntry
 from fieldcal.config.find import configuration_of, find_source
-from fieldcal.flows.connection import connected
+from fieldcal.flows.connection import URL, connected
 from fieldcal.flows.server import running_server
 from fieldcal.warehouse.layout import prepare
 from fieldcal.words.talk import say
@@ -16,7 +17,7 @@ from fieldcal.words.talk import say
 if TYPE_CHECKING:
     from prefect import State
 
-    from fieldcal.batch.night import Watcher
+    from fieldcal.batch.night import Night, Watcher
 
 
 def run_night(
@@ -28,7 +29,8 @@ def run_night(
     progress: Watcher | None = None,
     **where: str | None,
 ) -> NightDocument:
-    """Run the flow `nightly`, or `session` for that folder of the archive; its JSON, with how long it took.
+    """Run the flow `nightly`, or `session` for that folder of the archive; its JSON, with how long it took. Where nothing
+    is new there is no flow to run, and no server is started; one that the environment names hears of the night.
 
     `where` may hold `runner` and `scheduler` (`runners`). `seconds` is the whole duration, `server_seconds` what
     of it went into importing Prefect and into waiting for its server once the night was planned, `stage_seconds` the
@@ -37,43 +39,52 @@ def run_night(
     began = time.monotonic()
     find_source(config, archive)
     prepare(root)
-    runner, scheduler = where.get("runner") or "process", where.get("scheduler")
-    with running_server(root) as server:
+    from fieldcal.batch.ending import quiet_night
+    from fieldcal.batch.night import plan_night
+
+    night = plan_night(archive, root, config, session)
+    if night.has_work() or os.environ.get(URL):
+        result, start_s = _with_prefect(night, workers, progress, **where)
+    else:
+        result, start_s = quiet_night(night, progress, workers), 0.0
+    told: dict[str, object] = dict(result)
+    logs = told.pop("logs")
+    told |= {"seconds": round(time.monotonic() - began, 3), "server_seconds": round(start_s, 3)}
+    return cast(NightDocument, {**told, "logs": logs})
+
+
+def _with_prefect(
+    night: Night, workers: int, progress: Watcher | None, runner: str | None = None, scheduler: str | None = None
+) -> tuple[NightDocument, float]:
+    """The night as a flow run; what came out, and the seconds that went into Prefect's start."""
+    with running_server(night.root) as server:
         starting = time.monotonic()
-        from fieldcal.batch.night import plan_night
         from fieldcal.flows.housekeeping import tidy_prefect
         from fieldcal.flows.nightly import flow_of
         from fieldcal.flows.processes import Processes
         from fieldcal.flows.runners import Parallel, batches
 
-        imported = time.monotonic()
-        night = plan_night(archive, root, config, session)
-        parallel = Parallel(workers, runner, scheduler)
+        parallel = Parallel(workers, runner or "process", scheduler)
         with Processes(parallel.spawned(len(batches(night.missing(), workers)))) as processes:
-            waiting = time.monotonic()
             url = server.wait()
-            start_s = imported - starting + time.monotonic() - waiting
+            start_s = time.monotonic() - starting
             with server.explained(), connected(url):
-                tidy_prefect(root, url, own_server=server.own)
+                tidy_prefect(night.root, url, own_server=server.own)
                 kept: list[NightDocument] = []
                 planned = flow_of(night, parallel, progress, processes, kept.append)
+                folder = str(night.session or night.archive)
                 try:
                     state: State[None] = cast(Any, planned)(
-                        str(session or archive), str(root), workers, runner, return_state=True
+                        folder, str(night.root), workers, parallel.runner, return_state=True
                     )
                     if not kept:
                         state.result()  # raises what ended it
-                    result = kept[0]
                 except Exception as error:
                     if not kept:
                         raise
-                    result = kept[0]
                     why = type(error).__name__
                     say(f"Prefect's server was lost ({why}): the night is whole, Prefect's record of it is not.")
-    told: dict[str, object] = dict(result)
-    logs = told.pop("logs")
-    told |= {"seconds": round(time.monotonic() - began, 3), "server_seconds": round(start_s, 3)}
-    return cast(NightDocument, {**told, "logs": logs})
+    return kept[0], start_s
 
 
 def dry_run(archive: Path, root: Path, config: Path | None, session: Path | None) -> PlanDocument:

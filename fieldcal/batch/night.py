@@ -49,6 +49,10 @@ class Night:
         """Flights with steps to run."""
         return [job for job in self.plan.jobs if job.flight_id in self.plan.missing]
 
+    def has_work(self) -> bool:
+        """Whether anything is to be calibrated or published."""
+        return bool(self.plan.missing or self.plan.unchanged)
+
     def unchanged(self) -> Iterator[Outcome]:
         """Outcomes of the flights that had to be looked at and all of whose results are there."""
         for job in self.plan.jobs:
