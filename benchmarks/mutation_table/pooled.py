@@ -211,12 +211,6 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): "of so many Student's t is normal",
     (
         "estimation.pooled.strengths",
-        "innovations",
-        "of_c = of_c + strengths.walk * np.where(started, day - last, 0.0)",
-        "0.0 → 1.0",
-    ): "the variance of a series that has not begun is set when it does",
-    (
-        "estimation.pooled.strengths",
         "strengths_of.cost",
         "outside = np.sum(np.maximum(np.abs(x) - LIMITS[1], 0.0) ** 2)",
         "** → *",
