@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from mutation_table.reasons import ANY_NEGATIVE, CONVERGED, ENDS_MASKED, GUARD, LENGTH, NEVER_MET, RCOND, ROUNDS
+from mutation_table.reasons import (
+    ANY_NEGATIVE,
+    CONVERGED,
+    ENDS_MASKED,
+    GUARD,
+    LENGTH,
+    NEVER_MET,
+    RCOND,
+    ROUNDS,
+    SAME_MINUS,
+)
 
 EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("estimation.clock_sync.by_field", "", "MAX_ITERATIONS = 12", "12 → 13"): CONVERGED,
@@ -18,18 +28,8 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "slope = coefficients[:9].T @ moved.reshape(9, -1) / deviation * root",
         "1 → 2",
     ): ANY_NEGATIVE,
-    (
-        "estimation.clock_sync.by_field",
-        "_clock",
-        "flat = columns.reshape(6, -1)",
-        "1 → 2",
-    ): ANY_NEGATIVE,
-    (
-        "estimation.clock_sync.by_field",
-        "_clock",
-        "by_clock = columns.reshape(2, -1)",
-        "1 → 2",
-    ): ANY_NEGATIVE,
+    ("estimation.clock_sync.by_field", "_clock", "flat = columns.reshape(6, -1)", "1 → 2"): ANY_NEGATIVE,
+    ("estimation.clock_sync.by_field", "_clock", "by_clock = columns.reshape(2, -1)", "1 → 2"): ANY_NEGATIVE,
     (
         "estimation.clock_sync.by_field",
         "_clock",
@@ -66,18 +66,8 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "if abs(step[0]) < 1e-8 and abs(step[1]) < 1e-9:",
         "1e-09 → 1.1000000000000001e-09",
     ): CONVERGED,
-    (
-        "estimation.clock_sync.by_field",
-        "_clock",
-        "if abs(step[0]) < 1e-8 and abs(step[1]) < 1e-9:",
-        "0 → 1",
-    ): CONVERGED,
-    (
-        "estimation.clock_sync.by_field",
-        "_clock",
-        "if abs(step[0]) < 1e-8 and abs(step[1]) < 1e-9:",
-        "1 → 2",
-    ): CONVERGED,
+    ("estimation.clock_sync.by_field", "_clock", "if abs(step[0]) < 1e-8 and abs(step[1]) < 1e-9:", "0 → 1"): CONVERGED,
+    ("estimation.clock_sync.by_field", "_clock", "if abs(step[0]) < 1e-8 and abs(step[1]) < 1e-9:", "1 → 2"): CONVERGED,
     (
         "estimation.clock_sync.by_field",
         "",
@@ -322,4 +312,82 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "inside = (nearest >= 1) & (nearest < len(vps.rate) - 1) & imu.valid",
         "< → <=",
     ): ENDS_MASKED,
+    (
+        "estimation.clock_sync.handedness",
+        "Handedness.is_mirror",
+        "return self.from_rotation > self.from_mirror + MIRROR_SHARE",
+        "> → >=",
+    ): NEVER_MET,
+    (
+        "estimation.clock_sync.handedness",
+        "better_readings",
+        "if handedness(fit).is_rotation and 1.0 - fit.explained < CLEARLY * (1.0 - explained):",
+        "< → <=",
+    ): NEVER_MET,
+    (
+        "estimation.clock_sync.handedness",
+        "handedness",
+        "m = fit.matrix / np.maximum(row, 1e-300)[:, None]",
+        "1e-300 → 1.1000000000000002e-300",
+    ): GUARD,
+    (
+        "estimation.clock_sync.handedness",
+        "mounting_deg",
+        "rotation = nearest_rotation(fit.matrix / np.maximum(row, 1e-300)[:, None])",
+        "1e-300 → 1.1000000000000002e-300",
+    ): GUARD,
+    (
+        "estimation.clock_sync.handedness",
+        "_distance",
+        "d = np.diag([1.0, 1.0, determinant * np.sign(np.linalg.det(u) * np.linalg.det(vt))])",
+        "* → /",
+    ): SAME_MINUS,
+    (
+        "estimation.clock_sync.handedness",
+        "_distance",
+        "d = np.diag([1.0, 1.0, determinant * np.sign(np.linalg.det(u) * np.linalg.det(vt))])",
+        "* → / #2",
+    ): SAME_MINUS,
+    (
+        "estimation.clock_sync.repeated_poses",
+        "_angle",
+        "return np.asarray(2.0 * np.arccos(np.clip(np.nan_to_num(cosine, nan=1.0), 0.0, 1.0)))",
+        "1.0 → 1.1",
+    ): "what is more is clipped to 1",
+    (
+        "estimation.clock_sync.repeated_poses",
+        "_frozen_runs",
+        "jumped = out > 2.0 * ordinary + least",
+        "> → >=",
+    ): NEVER_MET,
+    (
+        "estimation.clock_sync.repeated_poses",
+        "_frozen_runs",
+        "short, short_last = np.quantile(step, [SHORT_STEPS, SHORT_LAST_STEPS]) if len(step) else (0.0, 0.0)",
+        "0.0 → 1.0",
+    ): "a record of one pose has no step, short or long",
+    (
+        "estimation.clock_sync.repeated_poses",
+        "_frozen_runs",
+        "short, short_last = np.quantile(step, [SHORT_STEPS, SHORT_LAST_STEPS]) if len(step) else (0.0, 0.0)",
+        "0.0 → 1.0 #2",
+    ): "a record of one pose has no step, short or long",
+    (
+        "estimation.clock_sync.repeated_poses",
+        "_speed",
+        "return np.asarray(_angle(q[a], q[b]) / np.maximum(t[b] - t[a], 1e-6))",
+        "1e-06 → 1.1e-06",
+    ): GUARD,
+    (
+        "estimation.clock_sync.repeated_poses",
+        "_default",
+        "jumps = np.maximum(np.r_[0.0, step], np.r_[step, 0.0]) > max(limit, LEAST_JUMP_RAD)",
+        "> → >=",
+    ): NEVER_MET,
+    (
+        "estimation.clock_sync.repeated_poses",
+        "_frozen_runs",
+        "too_fast = np.maximum(*(np.maximum(v, 0.0) for v in slowed)) ** 2 / (2.0 * FASTEST_STOP_RADPS2) > least",
+        "> → >=",
+    ): NEVER_MET,
 }

@@ -295,7 +295,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "least_squares_covariance",
         "inverse = np.linalg.pinv((flat / scale).T @ (flat / scale), hermitian=True) / np.outer(scale, scale)",
         "True → False",
-    ): "another algorithm for the same inverse",
+    ): ALGORITHM,
     (
         "estimation.statistics",
         "least_squares_covariance",
@@ -390,4 +390,11 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("estimation.warm_up", "fit_warm_up", "if span < LEAST_SPAN_DEGC:", "< → <="): NEVER_MET,
     ("estimation.warm_up", "_longest_run", "return slice(0, 0)", "0 → 1"): "any slice of no windows is empty",
     ("estimation.warm_up", "_longest_run", "return slice(0, 0)", "0 → 1 #2"): "any slice of no windows is empty",
+    (
+        "estimation.wahba",
+        "_quest_solution",
+        "step = ((square - ab) * square - c * lam + constant) / np.where(np.abs(slope) > 1e-14, slope, 1.0)",
+        "1e-14 → 1.1e-14",
+    ): GUARD,
+    ("estimation.wahba", "nearest_rotation", "return np.asarray((u * signs[..., None, :]) @ vt)", "* → /"): SAME_MINUS,
 }

@@ -54,12 +54,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "0 → 1",
     ): "parameters and temperature hold all the time",
     ("exports.autopilots.comparison", "", "ROUNDING = 1e-9", "1e-09 → 1.1000000000000001e-09"): RCOND,
-    (
-        "exports.autopilots.comparison",
-        "_shown",
-        "return 0.0 if abs(value) < ROUNDING else value",
-        "< → <=",
-    ): NEVER_MET,
+    ("exports.autopilots.comparison", "_shown", "return 0.0 if abs(value) < ROUNDING else value", "< → <="): NEVER_MET,
     (
         "exports.autopilots.comparison",
         "_of_sensor",
@@ -136,12 +131,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         'ids = {s: str(rows.filter(sensor=s)["unit_id"][0]) for s in triads}',
         "0 → 1",
     ): "the rows of a sensor are one unit's",
-    (
-        "exports.handed_out",
-        "_became",
-        'same=(pl.col("set_to") - pl.col("exported")).abs()',
-        "<= → <",
-    ): NEVER_MET,
+    ("exports.handed_out", "_became", 'same=(pl.col("set_to") - pl.col("exported")).abs()', "<= → <"): NEVER_MET,
     (
         "exports.json_document",
         "json_document",
@@ -160,4 +150,10 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         'return text.replace("e", ".0e", 1) if "e" in text and "." not in text else text',
         "1 → 2",
     ): "a number has one exponent",
+    (
+        "exports.refit",
+        "_ellipsoid",
+        "magnitude=float(shares @ [one.magnitude or 0.0 for one in flights]) or float(first.magnitude or 1.0),",
+        "0.0 → 1.0",
+    ): "flights without a length are fitted to 1 either way",
 }

@@ -233,4 +233,10 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "if np.isfinite(now.covariance[at, at]) and now.covariance[at, at] > 0.0:",
         "> → >=",
     ): NEVER_MET,
+    (
+        "estimation.pooled.strengths",
+        "_starts",
+        "return [np.array([walk * a, scatter * a, slope * b]) for a in TIMES for b in times]",
+        "* → /",
+    ): START,
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numerics_support import rms
@@ -76,3 +78,14 @@ def test_too_few_readings_leave_the_gyroscope_alone() -> None:
     fit, t, q = gyro_clock(r)
     logged = np.where(np.arange(len(r.t))[:, None] < 150, r.counts["magnetometer"], np.nan)
     assert refine_by_field(r.t, logged, t, q, fit) == (fit, None)
+
+
+def test_clocks_contradict_each_other_by_their_distance_in_what_both_and_slower_motion_leave_open() -> None:
+    r = simulate(seed=4, **MOVING)
+    fit, t, q = gyro_clock(r)
+    fit = replace(fit, spread=np.array([3e-4, 2e-5]))
+    _, own = refine_by_field(r.t, r.counts["magnetometer"], t, q, fit)
+    assert own is not None
+    apart = np.array([own.lag_mid_s - fit.lag_mid_s, own.skew - 1e-6 * fit.skew_ppm])
+    total = own.covariance + fit.covariance + np.diag([9e-8, 4e-10])
+    assert own.disagreement == pytest.approx(apart @ np.linalg.inv(total) @ apart)

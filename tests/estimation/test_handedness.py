@@ -5,9 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numerics_support import random_attitudes
+from scipy.linalg import polar
+from scipy.spatial.transform import Rotation
 
 from fieldcal.estimation.clock_sync import by_rates
-from fieldcal.estimation.clock_sync.handedness import READINGS, better_readings, handedness, mounting_deg
+from fieldcal.estimation.clock_sync.by_rates import SyncFit
+from fieldcal.estimation.clock_sync.handedness import (
+    READINGS,
+    Handedness,
+    better_readings,
+    handedness,
+    mounting_deg,
+)
 from fieldcal.geometry.rotation import conjugate, from_rotation_vector, multiply
 from fieldcal.simulation.experiment import Experiment, Motion
 
@@ -77,3 +86,49 @@ def test_a_shear_is_no_rotation() -> None:
     found = handedness(by_rates.synchronise(t, sheared, t_vps, q))
     assert not found.is_mirror
     assert not found.is_rotation
+
+
+def mapped(matrix: np.ndarray, turning: np.ndarray) -> SyncFit:
+    return SyncFit(0.0, 0.0, np.eye(2), 1.0, 0.0, 0.1, 1.0, matrix, 0.0, 0.0, turning)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_map_that_is_a_rotation_is_off_a_mirror_by_four_times_the_least_turns(mirrored: bool) -> None:
+    """Of turns about three axes the nearest mirror flips the one that moves least; the gyroscope's scales are out."""
+    rng = np.random.default_rng(4)
+    axes = Rotation.random(random_state=rng).as_matrix()
+    turning = axes @ np.diag([3.0, 2.0, 0.7]) @ axes.T
+    matrix = np.diag([0.7, 1.3, 2.0]) @ Rotation.random(random_state=rng).as_matrix() * (-1.0 if mirrored else 1.0)
+    found = handedness(mapped(matrix, turning))
+    off = (found.from_mirror, found.from_rotation) if mirrored else (found.from_rotation, found.from_mirror)
+    assert off == (pytest.approx(0.0, abs=1e-12), pytest.approx(4.0 * 0.7 / 5.7))
+
+
+def test_the_mounting_is_the_maps_rotation_whatever_the_scales() -> None:
+    for degrees in (0.0, 30.0, 170.0):
+        turn = Rotation.from_rotvec(np.radians(degrees) * np.array([2.0, -1.0, 2.0]) / 3.0).as_matrix()
+        assert mounting_deg(mapped(np.diag([0.7, 1.3, 2.0]) @ turn, np.eye(3))) == pytest.approx(degrees, abs=1e-5)
+    rough = np.array([[1.0, 0.3, -0.2], [-0.1, 1.5, 0.4], [0.3, -0.2, 0.6]])  # sheared too: the nearest of its rows
+    nearest, _ = polar(rough / np.linalg.norm(rough, axis=1)[:, None])
+    assert mounting_deg(mapped(rough, np.eye(3))) == pytest.approx(
+        np.degrees(Rotation.from_matrix(nearest).magnitude())
+    )
+    for seed in range(50):  # a trace of three but for rounding
+        tiny = np.eye(3) + 1e-9 * np.random.default_rng(seed).normal(size=(3, 3))
+        assert mounting_deg(mapped(tiny, np.eye(3))) < 1e-4
+
+
+def test_what_is_plainly_a_mirror_and_what_may_be_a_rotation() -> None:
+    assert Handedness(0.5, 0.449).is_mirror
+    assert not Handedness(0.5, 0.451).is_mirror
+    assert Handedness(0.149, 0.5).is_rotation
+    assert Handedness(0.15, 0.5).is_rotation
+    assert not Handedness(0.151, 0.5).is_rotation
+    assert not Handedness(0.14, 0.01).is_rotation
+
+
+@pytest.mark.parametrize(("leaves", "better"), [(0.96, True), (0.98, False)])
+def test_a_reading_is_better_that_leaves_three_per_cent_less_unexplained(leaves: float, better: bool) -> None:
+    t, rate, t_vps, q = record()
+    explained = 1.0 - (1.0 - by_rates.synchronise(t, rate, t_vps, q).explained) / leaves
+    assert list(better_readings(t, rate, t_vps, {"as it is": q}, explained, **LIMITS)) == ["as it is"][: int(better)]

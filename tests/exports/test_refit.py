@@ -17,9 +17,10 @@ from onboard_support import readings, tilting
 
 import fieldcal
 from fieldcal.cli.main import run
-from fieldcal.exports.refit import _noise
+from fieldcal.exports.refit import _by_axis, _noise, _rates
 from fieldcal.geometry.rotation import from_rotation_vector, multiply
 from fieldcal.onboard import Limits, Moments, MomentsFit, RateEquations, RatesFit, dump
+from fieldcal.onboard.rates import WEIGHT, fit_rates, noise_kept, recentred
 from fieldcal.simulation.archive import settings, signals
 from fieldcal.simulation.experiment import Experiment, simulate
 from fieldcal.stages.pipeline import PIPELINE
@@ -231,6 +232,46 @@ def test_the_gyroscopes_equations_add_up_too(tmp_path: Path) -> None:
     np.testing.assert_allclose(one.fit.scale, scale, rtol=0.02)
     sd = {r["axis"]: r["sd"] for r in one.rows if r["parameter"] == "zero"}
     assert sd["x"] == pytest.approx(np.sqrt(_zero_variance(expected, 0)))
+
+
+def test_the_gyroscopes_flights_add_up_in_any_order_whatever_their_blocks() -> None:
+    """Of readings' noise a block keeps a share: in the mean of both flights' blocks."""
+    t = 0.005 * np.arange(2000)
+    flown, kept, blocks = [], [], []
+    for k, (block, samples) in enumerate(((20, 2000), (8, 1000))):
+        rng = np.random.default_rng(k)
+        q, rate = finely_integrated(t[:samples], rng, refinement=2)
+        own = RateEquations(block)
+        own.feed(t[:samples] * 1e6, q, rate + 0.1 * rng.normal(size=(samples, 3)))
+        assert own.centre is not None
+        told = {"centre": own.centre.astype(float), "noise": own.noise.squares, "sums": own.values}
+        told |= {"n_differences": own.noise.n_differences, "n_samples": own.n_samples, "block_samples": block}
+        flown.append(cast(Any, SimpleNamespace(polarity=(1.0, 1.0, 1.0), **told)))
+        kept.append(noise_kept(block))
+        blocks.append(own.values[WEIGHT])
+        alone, expected = _rates([flown[-1]], 0.05), own.solve()
+        np.testing.assert_allclose(alone.scale, expected.scale, rtol=1e-9)
+        np.testing.assert_allclose(alone.bias, expected.bias, atol=1e-9)
+    about_first = recentred(flown[1].sums[None], flown[1].centre[None] - flown[0].centre[None])[0]
+    noise, differences = _noise(flown)
+    share = float(np.dot(kept, blocks) / np.sum(blocks))
+    expected = fit_rates(
+        flown[0].sums + about_first, flown[0].centre, noise, differences, noise_kept=share, n_samples=3000
+    )
+    for order in (flown, flown[::-1]):
+        found = _rates(order, 0.05)
+        for name in ("scale", "bias", "scale_sd", "bias_sd", "covariance"):
+            np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-7, atol=1e-12)
+
+
+def test_scale_and_bias_of_one_axis_alone_go_together() -> None:
+    sd, bias_sd, covariance = np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0]), np.array([0.05, -0.2, 0.4])
+    nothing = np.zeros(3)
+    found = _by_axis(RatesFit((None,) * 3, nothing, sd, nothing, bias_sd, covariance, nothing, nothing, 9))
+    for i in range(3):
+        own = [[sd[i] ** 2, covariance[i]], [covariance[i], bias_sd[i] ** 2]]
+        np.testing.assert_allclose(found[np.ix_([i, 3 + i], [i, 3 + i])], own)
+    assert np.count_nonzero(found) == 12
 
 
 def _zero_variance(fit: RatesFit, axis: int) -> float:

@@ -115,8 +115,11 @@ def test_the_largest_likely_strength_is_where_the_likelihood_has_fallen_by_half_
     np.testing.assert_array_equal(best, [1.0, -2.0])
     # A sd a thousand times a session's own is the largest that is looked for.
     for rises_at, found in ((2.0 * np.log(990.0), 2.0 * np.log(990.0)), (2.0 * np.log(1010.0), 1.0)):
-        rising = largest_likely(lambda x, at=rises_at: RISE * (1.0 + x[0] - at), best, 0.0, 0)
-        assert rising == pytest.approx(found, abs=0.02)
+
+        def rising(x: np.ndarray, at: float = rises_at) -> float:
+            return RISE * (1.0 + float(x[0]) - at)
+
+        assert largest_likely(rising, best, 0.0, 0) == pytest.approx(found, abs=0.02)
     # A likelihood that never falls so far tells nothing: the likeliest stays.
     assert largest_likely(lambda x: 0.01 * x[0], best, 0.01, 0) == 1.0
 
@@ -208,12 +211,13 @@ def test_another_start_and_a_nearer_end_find_the_same_strengths(monkeypatch: pyt
         value = 0.03 * rng.normal() * warmth + np.cumsum(0.1 * rng.normal(size=12)) + rng.normal(size=12)
         rows.append(np.column_stack([day, warmth, value, np.full(12, 0.2)]))
     plain = strengths_of(Series.of(rows))
-    for name, value in (
+    others: tuple[tuple[str, object], ...] = (
         ("START", (0.3, 0.3, 0.3)),
         ("TIMES", (1.2, 5.0, 20.0)),
         ("LIMITS", (2.0 * np.log(1e-4), module.LIMITS[1])),
         ("TOLERANCES", {"fatol": 0.001, "xatol": 0.002}),
-    ):
+    )
+    for name, value in others:
         with monkeypatch.context() as patch:
             patch.setattr(module, name, value)
             found = strengths_of(Series.of(rows))
@@ -228,7 +232,7 @@ def test_coarse_strengths_are_the_nearest_power_of_one_and_a_quarter(power: int)
     for within in (-0.49, 0.0, 0.49):
         near = exact * 1.25**within
         found = Strengths(near, 0.0, near, near).coarse()
-        assert (found.walk, found.scatter, found.slope) == (pytest.approx(exact), 0.0, pytest.approx(exact))
+        np.testing.assert_allclose([found.walk, found.scatter, found.slope], [exact, 0.0, exact], atol=0.0)
         assert found.freedom == round(exact)
 
 
