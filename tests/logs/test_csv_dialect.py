@@ -47,8 +47,15 @@ def test_times_of_day(text: str, expected: int | None) -> None:
 )
 @pytest.mark.parametrize(
     ("fraction", "below"),
-    [("", 0), (".5", S // 2), (",25", S // 4), (".1234567894", 123_456_789), (".1234567895", 123_456_790)]
-    + [(".12345678949", 123_456_789), (".9999999995", S)],
+    [
+        ("", 0),
+        (".5", S // 2),
+        (",25", S // 4),
+        (".1234567894", 123_456_789),
+        (".1234567895", 123_456_790),
+        (".12345678949", 123_456_789),
+        (".9999999995", S),
+    ],
 )
 def test_dates_in_zones(zone: str, east_s: int, fraction: str, below: int) -> None:
     begin = int(datetime(2024, 2, 29, 12, 34, 56, tzinfo=UTC).timestamp())

@@ -418,7 +418,7 @@ def test_the_magnetometer_of_the_highest_priority_is_the_primary_one(
 def test_a_slot_without_a_device_has_no_priority(tmp_path: Path, number: int, primary: int) -> None:
     file = log_of(tmp_path / "a.ulg", imu_topic("sensor_mag", 7, 20.0), imu_topic("sensor_mag", number, 20.0, 1))
     found = units.magnetometers(file, {"CAL_MAG0_ID": number, "CAL_MAG0_PRIO": 75})
-    assert [unit.device_id for unit in found][0] == primary
+    assert next(unit.device_id for unit in found) == primary
 
 
 def test_the_first_calibrated_magnetometer_is_the_primary_one(tmp_path: Path) -> None:
@@ -458,8 +458,15 @@ def test_a_raw_magnetometer_is_preferred_down_to_a_rate(tmp_path: Path, raw_hz: 
     assert (unit.stream.name, unit.primary) == (name, True)
 
 
+@pytest.mark.filterwarnings("error")
 def test_a_magnetometer_held_in_sensor_combined(tmp_path: Path) -> None:
-    for relatives, rate in (((0, -10_000, 0, -10_000), 50.0), ((0, -10_000), 0.0), ((0, -10_000, 0), 50.0)):
+    for relatives, rate in (
+        ((0, -10_000, 0, -10_000), 50.0),
+        ((0, -10_000), 0.0),
+        ((0, -10_000, 0), 50.0),
+        ((0, -5000, -20_000), 0.0),  # times that do not grow
+        ((2**31 - 1, 2**31 - 1), 0.0),
+    ):
         n = len(relatives)
         columns = {
             "timestamp": stamps(*(10_000 * i + 1 for i in range(n))),
