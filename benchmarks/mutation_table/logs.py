@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from mutation_table.reasons import ANY_NEGATIVE, AT_A_TIME, LOOKED_AT, RCOND, REFUSED_NEXT, ROOM, UNREAD, WIDTHS
+from mutation_table.reasons import (
+    ANY_NEGATIVE,
+    AT_A_TIME,
+    LOOKED_AT,
+    NEVER_MET,
+    RCOND,
+    REFUSED_NEXT,
+    ROOM,
+    UNREAD,
+    WIDTHS,
+)
 
 EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("logs.csv.dialect", "", "_LINES_LOOKED_AT = 50", "50 → 55"): LOOKED_AT,
@@ -518,4 +528,10 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "if len(paths) == 1 and want.width > 1:",
         "> → >=",
     ): "a single number has no components",
+    (
+        "logs.csv.conversion",
+        "with_quaternion",
+        "proper = np.abs(np.linalg.det(matrices) - 1.0) < ROTATION_TOLERANCE",
+        "< → <=",
+    ): NEVER_MET,
 }

@@ -17,14 +17,23 @@ from fieldcal.errors import UnreadableLog
 from fieldcal.logs import LogSummary, read_log
 from fieldcal.logs.csv import conversion, instances
 from fieldcal.logs.csv.attitude import MATRIX, quaternion_by_names
-from fieldcal.logs.csv.columns import Columns, attitude_columns, known_by_names, signal_groups
+from fieldcal.logs.csv.columns import (
+    IMU_DEFAULTS,
+    Columns,
+    attitude_columns,
+    find_columns,
+    known_by_names,
+    no_attitude,
+    signal_groups,
+    without_absent,
+)
 from fieldcal.logs.csv.dialect import Dialect
-from fieldcal.logs.csv.folder import folder_layout
+from fieldcal.logs.csv.folder import folder_layout, optional_files
 from fieldcal.logs.csv.losses import Losses
 from fieldcal.logs.csv.presets.betaflight import BETAFLIGHT
 from fieldcal.logs.csv.presets.by_columns import X_IO
 from fieldcal.logs.csv.presets.choice import PRESETS, ReadAs, read_as
-from fieldcal.logs.csv.presets.layout import Layout, Meaning, positive
+from fieldcal.logs.csv.presets.layout import Layout, Meaning, layout_of, positive
 from fieldcal.logs.csv.presets.motion_capture import MOTIVE, QUALISYS, VICON_NEXUS
 from fieldcal.logs.csv.presets.plotjuggler import PLOTJUGGLER
 from fieldcal.logs.csv.presets.xsens import XSENS_MT
@@ -72,6 +81,10 @@ def test_scales_of_a_blackbox(header: tuple[str, ...], gyroscope: float | None) 
     assert (found.factors["accelerometer"], found.units["accelerometer"], found.told) == (1 / 2048, "g", "")
 
 
+def test_the_explorers_readings_are_not_told_as_raw() -> None:
+    assert meaning("betaflight", layout(f"loopIteration,time,{GYRO},{ACC}", (EXPLORER,))).told == ""
+
+
 def test_a_blackbox_has_a_loop_a_time_and_a_gyroscope() -> None:
     whole = f"loopIteration,time (us),{GYRO},{ACC}"
     assert meaning("betaflight", layout(whole)).told == "its readings are raw, in no known unit"
@@ -117,6 +130,15 @@ def test_of_several_topics_none_is_chosen() -> None:
     both = poses["/p"] + poses["/q"].removeprefix("__time")
     assert str(PLOTJUGGLER.read(layout(both))).startswith("it has several poses, /p, /q:")
     assert isinstance(PLOTJUGGLER.read(layout("time," + plotted("/a"))), str)
+    for estimate in ("/odometry/filtered", "/ekf/pose"):
+        named_so = ",".join(["__time", *(part.format(estimate) for part in pose)])
+        assert isinstance(PLOTJUGGLER.read(layout(named_so)), str)
+    twist = ",/p/twist/twist/linear/x"
+    assert isinstance(PLOTJUGGLER.read(layout(poses["/p"] + twist)), str)
+    px4 = "__time," + ",".join(f"sensor_combined/gyro_rad.0{i}" for i in range(3))
+    assert isinstance(PLOTJUGGLER.read(layout(px4)), str)
+    px4 += "," + ",".join(f"sensor_combined/accelerometer_m_s2.0{i}" for i in range(3))
+    assert meaning("plotjuggler", layout(px4)).body == "frd"
 
 
 BODY = "X,Y,Z,Roll,Pitch,Yaw,Residual," + ",".join(f"Rot[{i}]" for i in range(9))
@@ -149,7 +171,9 @@ def test_times_and_bodies_of_qualisys(
     assert found.vps["rotation_matrix"] == tuple(f"body Rot[{i}]" for i in range(9))
     assert found.vps["position"] == ("body X", "body Y", "body Z")
     assert found.names is not None
-    assert set(found.vps["rotation_matrix"]) <= set(found.names)
+    own = [f"body {name}" for name in ("X", "Y", "Z")], [f"body Rot[{i}]" for i in range(9)]
+    before = names.split(",")[: -len(BODY.split(","))]
+    assert list(found.names) == [*before, *own[0], "Roll", "Pitch", "Yaw", "Residual", *own[1]]
     assert found.metre == 1e-3
 
 
@@ -184,6 +208,42 @@ def test_units_spaces_and_bodies_of_motive() -> None:
     assert np.allclose(Rotation.from_quat(turn).apply([0.0, 1.0, 0.0]), [0.0, 0.0, 1.0], atol=1e-12)
 
 
+def test_names_and_lines_of_motive() -> None:
+    whole = motive_layout()
+    found = meaning("motive", whole)
+    owned = [f"b0 Rotation {axis}" for axis in "XYZW"] + [f"b0 Position {axis}" for axis in "XYZ"]
+    assert found.names == ("Frame", "Time (Seconds)", *owned)
+    assert found.vps["t"] == "Time (Seconds)"
+    place = whole.names[:6]
+    above = tuple(",".join(line.split(",")[:6]) for line in whole.above)
+    turned = MOTIVE.read(Layout(place, (), above, (), ","))
+    assert isinstance(turned, Meaning)
+    assert set(turned.vps) == {"t", "quaternion_xyzw"}
+    for names in (("Frame",), ("Frame", "Clock"), ("Row", "Time")):
+        assert str(MOTIVE.read(Layout(names, (), above, (), ","))).startswith("its columns do not begin")
+    for lines in (above[:1], above[:2]):
+        assert MOTIVE.read(Layout(place, (), lines, (), ",")) == "it holds no rigid body"
+    short = (above[0], ",Type", ",Name,b0,b0,b0,b0", above[3])
+    assert MOTIVE.read(Layout(place, (), short, (), ",")) == "it holds no rigid body"
+    for kinds, owners in (("Rigid Body," * 4, "b0,b0,b0"), ("Rigid Body," * 3, "b0,b0,b0,b0")):
+        lines = (above[0], f",,{kinds.rstrip(',')}", f",,{owners}", above[3])
+        cut = MOTIVE.read(Layout(place, (), lines, (), ","))
+        assert isinstance(cut, Meaning)
+        assert cut.told == "it has no rigid body with an attitude"
+    marker = (above[0], above[1].replace("Rigid Body", "Marker", 1), *above[2:])
+    other = MOTIVE.read(Layout(place, (), marker, (), ","))
+    assert isinstance(other, Meaning)
+    assert other.names is not None
+    assert other.names[2:] == ("X", *(f"b0 Rotation {axis}" for axis in "YZW"))
+
+
+def test_a_block_above_the_header_is_laid_out_line_by_line() -> None:
+    block = b"\xef\xbb\xbfone\n\n two \nt,gx\n1,2\n"
+    found = layout_of(block, Dialect(",", ".", ("t", "gx"), b"t,gx", None, 4, 2, 4), ["1", "2"])
+    assert found == Layout(("t", "gx"), (), ("one", "two"), ("1", "2"), ",")
+    assert layout_of(b"t\n", Dialect(",", ".", ("t",), b"t", ("s",), 1), []).units == ("s",)
+
+
 def vicon_layout(names: str, owners: str, units: str, above: tuple[str, ...] = ("Objects", "120")) -> Layout:
     return layout(f"Frame,Sub Frame,{names}", (*above, f",,{owners}"), units=f",,{units}")
 
@@ -200,6 +260,8 @@ QUATERNION, VECTOR = "RX,RY,RZ,RW,TX,TY,TZ", "RX,RY,RZ,TX,TY,TZ"
         (vicon_layout(QUATERNION, "quad,,,,,,", ",,,,m,m,m"), None),
         (vicon_layout(QUATERNION, "quad,,,,,,", ",,,,mm,mm,mm", ("Objects", "fast")), None),
         (layout(f"Frame,{QUATERNION}", ("120", ",quad")), None),
+        (vicon_layout(QUATERNION, "quad,,,,,,", ",,,,mm,mm,mm", ("120",)), ("quaternion_xyzw", True)),
+        (layout(f"Frame,Sub Frame,{QUATERNION}", ("120",)), None),
     ],
 )
 def test_attitudes_of_vicon(of: Layout, found: tuple[str, bool] | None) -> None:
@@ -212,14 +274,23 @@ def test_attitudes_of_vicon(of: Layout, found: tuple[str, bool] | None) -> None:
         assert read.vps["position"] == ("quad TX", "quad TY", "quad TZ")
 
 
+def test_a_pose_without_a_place() -> None:
+    found = meaning("vicon_nexus", vicon_layout("RX,RY,RZ,RW,TX", "quad,,,,", ",,,,mm"))
+    assert set(found.vps) == {"t", "quaternion_xyzw"}
+    turned = meaning("vicon_nexus", vicon_layout(VECTOR, "quad,,,,,", "rad,rad,rad,mm,mm,mm"))
+    assert turned.told.startswith("RX, RY, RZ are taken for a rotation vector")
+    two = meaning("vicon_nexus", vicon_layout(f"{QUATERNION},{QUATERNION}", "a,,,,,,,b,,,,,,", ",,,,mm,mm,mm," * 2))
+    assert two.told.startswith("it holds several bodies, a, b:")
+
+
 def test_times_of_xsens() -> None:
     axes = ",".join(f"{sensor}_{axis}" for sensor in ("Gyr", "Acc", "Mag") for axis in "XYZ")
-    above = ("// General information", "// Update Rate: 100.5Hz")
+    above = ("// General information", "// Update Rate: 100.5Hz", "another line")
     fine = meaning("xsens_mt", layout(f"SampleTimeFine,{axes}", above, "123"))
     assert (fine.time_unit, fine.rate_hz, fine.units["magnetometer"]) == ("100us", None, "norm")
     counted = meaning("xsens_mt", layout(f"PacketCounter,SampleTimeFine,{axes}", above, "7,"))
     assert (counted.imu["t"], counted.time_unit, counted.rate_hz) == ("PacketCounter", None, 100.5)
-    for of in (layout(f"PacketCounter,{axes}", above[:1]), layout(f"PacketCounter,{axes}"), layout(axes, above)):
+    for of in (layout(f"PacketCounter,{axes}", above[::2]), layout(f"PacketCounter,{axes}"), layout(axes, above)):
         assert isinstance(XSENS_MT.read(of), str)
     assert isinstance(XSENS_MT.read(layout("PacketCounter," + axes.replace("Acc_Y", "Acc"), above)), str)
 
@@ -337,6 +408,46 @@ def test_signals_need_their_columns() -> None:
     assert dict(vps)["vps"] == [("position", ("px_m", "py_m", "pz_m"))]
 
 
+def test_columns_are_found_with_their_units_and_nearest_names_are_told() -> None:
+    found = find_columns(named("t [s],gx [rad/s],gy [rad/s],gz [rad/s]"), {}, IMU_DEFAULTS, "imu", "log")
+    assert found == Columns(0, {"gyroscope": (1, 2, 3)})
+    for name, told in (("abxy", "nearest: 'abxy'"), ("axyz", "it has 'axyz'")):  # half the letters, and a quarter
+        with pytest.raises(UnreadableLog) as refused:
+            find_columns(named(name), {"gyroscope": ("abcd", "b", "c")}, IMU_DEFAULTS, "imu", "log")
+        assert told in refused.value.sentence
+    both = Columns(0, {"gnss_velocity": (1, 2, 3), "gnss_velocity_sd": (4,)})
+    assert [key for key, _ in dict(signal_groups(both, None, apart=False))["gnss_velocity"]] == list(both.values)
+
+
+def test_an_optional_column_may_be_absent() -> None:
+    summary = LogSummary("csv")
+    wanted = {"temperature": "warm", "throttle": "thr", "gyroscope": ("a", "b", "c"), "position": ("a", "x", "b")}
+    kept = without_absent(named("a,b,c,thr,worm"), wanted, "imu", summary, "log")
+    assert kept == {"throttle": "thr", "gyroscope": ("a", "b", "c")}
+    assert [(finding.code, finding.count) for finding in summary.findings] == [("missing_column", 1)] * 2
+    first, second = (finding.sentence for finding in summary.findings)
+    assert "'warm' (csv.imu.temperature); nearest: 'worm'" in first
+    assert "'x' (csv.imu.position)" in second
+    listed = no_attitude(named(",".join(f"c{i:02d}" for i in range(30))), "log", "").sentence
+    assert ("c19" in listed, "c20" in listed) == (True, False)
+
+
+def test_angles_vectors_and_matrices_become_quaternions() -> None:
+    turns = Rotation.random(5, random_state=2)
+    by_angles = dict(zip(("yaw", "pitch", "roll"), turns.as_euler("ZYX", degrees=True).T, strict=True))
+    by_vector = dict(zip((f"rotation_{axis}" for axis in "xyz"), turns.as_rotvec().T, strict=True))
+    matrices = turns.as_matrix()
+    by_matrix = {name: matrices[:, k % 3, k // 3] for k, name in enumerate(MATRIX)}
+    for values, to_rad in ((by_angles, math.pi / 180), (by_vector, 1.0), (by_matrix, 1.0)):
+        found = conversion.with_quaternion(values, to_rad)
+        assert list(found) == ["qx", "qy", "qz", "qw"]
+        q = np.column_stack(list(found.values()))
+        assert np.allclose(np.abs(np.sum(q * turns.as_quat(), axis=1)), 1.0, atol=1e-12)
+        assert conversion.with_quaternion(found, 1.0) == found
+    still = conversion.in_world(found, (0.0, 0.0, 1.0, 0.0), 5.0)
+    assert list(still) == ["qx", "qy", "qz", "qw"]
+
+
 def test_matrices_that_are_no_rotation_are_no_attitude() -> None:
     turn = Rotation.from_rotvec([0.3, -0.2, 0.9])
     for scale, proper in (
@@ -437,6 +548,8 @@ def test_names_and_rows_of_imus() -> None:
     assert instances.names_in(cells) == ["a", "b"]
     assert instances.names_in(pl.Series([str(i) for i in range(10)])) == list("01234567")
     assert instances.rows_of(cells, "b").tolist() == [True, False, False, True]
+    assert "there are a, b. Correct" in instances.absent_unit("log", "i", cells, "c").sentence
+    assert "there are none. Correct" in instances.absent_unit("log", "i", cells[:0], "c").sentence
     assert instances.instance_column(("t", " IMU ", "i"), set()) == 2
     assert instances.instance_column(("t", " IMU ", "i"), {2}) == 1
     assert instances.instance_column(("t", "gx"), set()) is None
@@ -454,6 +567,8 @@ def test_losses_of_each_kind_lose_data_but_a_repeated_header() -> None:
     found = {f.code: f for f in losses.findings("log", "x" * 60)}
     assert {f.code: f.loses_data for f in found.values()} == {k: k != ReasonCode.REPEATED_HEADER for k in kinds}
     assert f"'{'x' * 60}' is none" in found[ReasonCode.BAD_TIME].sentence
+    assert "' is none" not in found[ReasonCode.BAD_NUMBER].sentence
+    assert all("' is none" not in f.sentence for f in losses.findings("log", None))
     found = {f.code: f for f in losses.findings("log", "x" * 61)}
     assert f"'{'x' * 60}…' is none" in found[ReasonCode.BAD_TIME].sentence
 
@@ -483,3 +598,9 @@ def test_folders_that_are_logs(tmp_path: Path, files: tuple[str, ...], apart: bo
         (tmp_path / name).touch()
     found = folder_layout(tmp_path)
     assert (None if found is None else found.apart) == apart
+    if found is not None:
+        assert list(optional_files(tmp_path, found)) == []
+        for name in ("Magnetometer.csv", "vps.csv"):
+            (tmp_path / name).touch()
+        expected = [("Magnetometer.csv", "imu"), ("vps.csv", "vps")]
+        assert list(optional_files(tmp_path, found)) == expected[not found.optional :]
