@@ -534,4 +534,16 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "proper = np.abs(np.linalg.det(matrices) - 1.0) < ROTATION_TOLERANCE",
         "< → <=",
     ): NEVER_MET,
+    (
+        "logs.rosbag1.records",
+        "read_record",
+        'opcode = fields.get(b"op", (0, b""))[1]',
+        "0 → 1",
+    ): "the place of what is not there",
+    (
+        "logs.rosbag1.records",
+        "messages_of",
+        'order = np.argsort(np.concatenate([part[0] for part in found]), kind="stable")',
+        "0 → 1",
+    ): "payloads lie in the order of their records",
 }
