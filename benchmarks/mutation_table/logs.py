@@ -546,4 +546,10 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         'order = np.argsort(np.concatenate([part[0] for part in found]), kind="stable")',
         "0 → 1",
     ): "payloads lie in the order of their records",
+    (
+        "logs.rosbag1.chunks",
+        "next_chunk",
+        "found = buffer.find(field, found + 1, limit)",
+        "1 → 2",
+    ): "the field does not begin anew a byte on",
 }
