@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from mutation_table.reasons import ANY_NEGATIVE, AT_A_TIME, LOOKED_AT, RCOND, REFUSED_NEXT, ROOM, UNREAD, WIDTHS
+from mutation_table.reasons import (
+    ANY_NEGATIVE,
+    AT_A_TIME,
+    LOOKED_AT,
+    NEVER_MET,
+    RCOND,
+    REFUSED_NEXT,
+    ROOM,
+    UNREAD,
+    WIDTHS,
+)
 
 EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("logs.csv.dialect", "", "_LINES_LOOKED_AT = 50", "50 → 55"): LOOKED_AT,
@@ -390,4 +400,156 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "True → False",
     ): "Polars sorts by one column stably, which it does not promise",
     ("logs.ulog.parameters", "", "_DEGREES = 4", "4 → 5"): "there is no parameter of the next one, and 0 stands for it",
+    (
+        "logs.csv.clock",
+        "FileClock.times",
+        "t = ticks.fill_null(0).to_numpy().copy()",
+        "0 → 1",
+    ): "rows without a time are left out",
+    (
+        "logs.csv.clock",
+        "FileClock._unwrapped",
+        "if not self._period and (step < 0).any():",
+        "< → <=",
+    ): "spares the search where no time steps back; it finds nothing there",
+    (
+        "logs.csv.clock",
+        "FileClock._unwrapped",
+        "if not self._period and (step < 0).any():",
+        "0 → 1",
+    ): "spares the search where no time steps back; it finds nothing there",
+    (
+        "logs.csv.clock",
+        "FileClock._found",
+        "if low.mean() > 0.5:",
+        "0.5 → 0.55",
+    ): "no share of up to eight rows lies between",
+    (
+        "logs.csv.dialect",
+        "comment_lines",
+        'return above[0].count(b"\\n") if above else 0',
+        "0 → 1 #2",
+    ): "the pattern matches anything",
+    (
+        "logs.csv.rows",
+        "_silent",
+        "for line in np.flatnonzero((ends - starts < 64) & blank & ~silent).tolist():",
+        "& → | #2",
+    ): "which lines are looked at one by one; the result is the same",
+    (
+        "logs.csv.rows",
+        "_silent",
+        "alike = np.flatnonzero((data[starts] == dialect.header[0]) & (ends - starts == len(dialect.header)))",
+        "& → |",
+    ): "which lines are compared; the result is the same",
+    (
+        "logs.ulog.parameters",
+        "correction",
+        'mounted = get(f"{prefix}ROT", -1.0)',
+        "1.0 → 1.1",
+    ): "any number below zero stands for the board's",
+    (
+        "logs.ulog.streams",
+        "joined",
+        "[clock.ns(stamps_us(rows)) for rows in file.chunks(accelerometer)] or [np.empty(0, np.int64)]",
+        "0 → 1",
+    ): "any number of stamps does where there are no rows",
+    (
+        "logs.ulog.streams",
+        "joined",
+        "whole = bool((np.diff(t_accelerometer) < 0).any())  # out of order: neighbours may lie anywhere",
+        "< → <=",
+    ): AT_A_TIME,
+    (
+        "logs.ulog.streams",
+        "joined",
+        "whole = bool((np.diff(t_accelerometer) < 0).any())  # out of order: neighbours may lie anywhere",
+        "0 → 1",
+    ): AT_A_TIME,
+    (
+        "logs.ulog.streams",
+        "joined",
+        "at_once = ROWS_AT_ONCE // (_SAMPLES_A_MESSAGE if is_fifo(gyroscope) else 1)",
+        "// → *",
+    ): AT_A_TIME,
+    (
+        "logs.ulog.streams",
+        "joined",
+        "low = max(int(np.searchsorted(t_accelerometer, t_ns.min())) - 2, 0)",
+        "2 → 3",
+    ): AT_A_TIME,
+    (
+        "logs.ulog.streams",
+        "joined",
+        'high = int(np.searchsorted(t_accelerometer, t_ns.max(), "right")) + 3',
+        "3 → 4",
+    ): AT_A_TIME,
+    (
+        "logs.ulog.units",
+        "longest",
+        "spans[key] = spans.get(key, 0) + max(until - one.from_us, 0)",
+        "0 → 1",
+    ): "each of them gets it once",
+    (
+        "logs.ulog.units",
+        "magnetometers",
+        "key = -1 - len(streams) if twin else number",
+        "1 → 2",
+    ): "any number that is no id",
+    (
+        "logs.ulog.units",
+        "magnetometers",
+        "streams[0] = [Stream(held[0], _held_rate_hz(file, held[0]))]",
+        "0 → 1",
+    ): "the only one",
+    ("logs.ulog.units", "first_id", "rows = file.rows(topic, 0, 1)", "1 → 2"): "the first row counts",
+    (
+        "logs.ulog.units",
+        "_held_rate_hz",
+        "t_ns = combined_magnetometer(rows, Clock(), -1)[0]",
+        "1 → 2",
+    ): "before every time",
+    (
+        "logs.ulog.units",
+        "_last_us",
+        "rows: Rows = file.rows(topic, file.count(topic) - 1)",
+        "1 → 2",
+    ): "the last row counts",
+    (
+        "logs.ulog.units",
+        "_column",
+        "return np.concatenate([rows[name] for rows in file.chunks(topic)] or [np.empty(0)])",
+        "0 → 1",
+    ): "a topic that is asked has rows",
+    ("logs.encodings.gather", "gather", "return np.empty((0, count) if count > 1 else 0, dtype)", "1 → 2"): WIDTHS,
+    (
+        "logs.encodings.protobuf_messages",
+        "ProtobufDecoder._resolved",
+        "if len(paths) == 1 and want.width > 1:",
+        "> → >=",
+    ): "a single number has no components",
+    (
+        "logs.csv.conversion",
+        "with_quaternion",
+        "proper = np.abs(np.linalg.det(matrices) - 1.0) < ROTATION_TOLERANCE",
+        "< → <=",
+    ): NEVER_MET,
+    (
+        "logs.rosbag1.records",
+        "read_record",
+        'opcode = fields.get(b"op", (0, b""))[1]',
+        "0 → 1",
+    ): "the place of what is not there",
+    (
+        "logs.rosbag1.records",
+        "messages_of",
+        'order = np.argsort(np.concatenate([part[0] for part in found]), kind="stable")',
+        "0 → 1",
+    ): "payloads lie in the order of their records",
+    (
+        "logs.rosbag1.chunks",
+        "next_chunk",
+        "found = buffer.find(field, found + 1, limit)",
+        "1 → 2",
+    ): "the field does not begin anew a byte on",
 }

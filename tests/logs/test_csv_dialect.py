@@ -47,8 +47,15 @@ def test_times_of_day(text: str, expected: int | None) -> None:
 )
 @pytest.mark.parametrize(
     ("fraction", "below"),
-    [("", 0), (".5", S // 2), (",25", S // 4), (".1234567894", 123_456_789), (".1234567895", 123_456_790)]
-    + [(".12345678949", 123_456_789), (".9999999995", S)],
+    [
+        ("", 0),
+        (".5", S // 2),
+        (",25", S // 4),
+        (".1234567894", 123_456_789),
+        (".1234567895", 123_456_790),
+        (".12345678949", 123_456_789),
+        (".9999999995", S),
+    ],
 )
 def test_dates_in_zones(zone: str, east_s: int, fraction: str, below: int) -> None:
     begin = int(datetime(2024, 2, 29, 12, 34, 56, tzinfo=UTC).timestamp())
@@ -158,7 +165,7 @@ def test_half_of_the_lines_looked_at_are_no_rows_of_the_first_line() -> None:
     """Where most lines fit the first, it is the header, whatever may stand below."""
     below = ["t,a,b,c,d,e", *["1,2,3,4,5,6"] * 3]
     for rows, place in ((3, 4), (4, 5), (5, 0), (6, 0)):
-        assert header_place(["t,a,b,c", *[ROW] * rows, *below], None, None) == place
+        assert header_place(["t,a,b", *["1,2,3"] * rows, *below], None, None) == place
 
 
 @pytest.mark.parametrize(("cell", "decimal", "place"), [("1,5", None, 1), ("1,5", ",", 1), ("1,5", ".", 0)])

@@ -403,6 +403,13 @@ def test_motor_compensation_is_told(tmp_path: Path, flight: DataflashFlight) -> 
     assert f"In {len(flight.mag_us)} MAG messages a part for the motors" in sentence(summary, "already_corrected")
 
 
+def test_a_magnetometer_alone_is_read_and_nothing_is_said_of_an_imu(tmp_path: Path, flight: DataflashFlight) -> None:
+    write.write_dataflash(tmp_path / "a.bin", [flight.messages()[2]], parameters=PARAMETERS)
+    found, summary = tables(tmp_path / "a.bin")
+    assert found.keys() == {"magnetometer"}
+    assert "low-passed too" not in sentence(summary, "already_corrected")
+
+
 def test_of_motors_nothing_is_said_where_no_magnetometer_was_logged(tmp_path: Path, flight: DataflashFlight) -> None:
     write.write_dataflash(tmp_path / "a.bin", flight.messages()[:2], parameters=PARAMETERS)
     _, summary = tables(tmp_path / "a.bin")

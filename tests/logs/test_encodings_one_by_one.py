@@ -9,6 +9,7 @@ import pytest
 from google.protobuf import descriptor_pb2
 
 from fieldcal.logs.encodings.decoded import Decoded, MissingField, UnsupportedSchema, Want
+from fieldcal.logs.encodings.gather import gather
 from fieldcal.logs.encodings.json_messages import JsonDecoder
 from fieldcal.logs.encodings.protobuf_messages import ProtobufDecoder
 
@@ -27,6 +28,17 @@ def decode(messages: list[object], wants: dict[str, Want]) -> Decoded:
 
 def stamped(nanoseconds: int) -> dict[str, object]:
     return {"header": {"stamp": {"sec": 0, "nanosec": nanoseconds}}, "x": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("count", "empty", "values"),
+    [(1, (0,), [1, 3]), (2, (0, 2), [[1, 2], [3, 4]]), (3, (0, 3), [[1, 2, 3], [3, 4, 5]])],
+)
+def test_values_lie_where_they_are_looked_for(count: int, empty: tuple[int, ...], values: list[object]) -> None:
+    data = np.arange(6, dtype=np.uint8)
+    assert gather(data, np.array([1, 3]), np.dtype(np.uint8), count).tolist() == values
+    assert gather(data, np.array([], np.int64), np.dtype(np.uint8), count).shape == empty
+    assert gather(data[:0], np.array([], np.int64), np.dtype(np.uint8), count).shape == empty
 
 
 @pytest.mark.parametrize("number", [True, False, "1.5", None, [1.5], {}])

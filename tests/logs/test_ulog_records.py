@@ -50,6 +50,7 @@ def keyed(key: str, value: bytes, before: bytes = b"") -> bytes:
         ("L", b"6" + b"\0" * 8, True),
         ("L", b"6" + b"\0" * 7, False),
         ("L", b"0" + b"\0" * 8 + b"hello", True),
+        ("L", b"7" + b"\0" * 8 + b"\0x", False),
         ("L", b"7" + b"\0" * 8 + b"x\0", False),
         ("L", b"8" + b"\0" * 8, False),
         ("C", b"6" + b"\0" * 10, True),
@@ -144,6 +145,12 @@ def test_rows_of_a_format(text: str, sizes: tuple[int, int] | None) -> None:
 def test_formats_are_nested_eight_deep(depth: int, sizes: tuple[int, int] | None) -> None:
     nested = {f"n{i}": f"n{i + 1} a;" for i in range(1, depth)}
     assert size_of("n1 a;", **nested, **{f"n{depth}": "uint8_t a;"}) == sizes
+
+
+def test_characters_are_texts_and_other_numbers_arrays() -> None:
+    kind, _ = row_kind("t", {"t": "char a;char[5] b;uint8_t c;uint8_t[5] d;uint8_t[1] e;"})
+    told = {name: (kind[name].base.str, kind[name].shape) for name in "abcde"}
+    assert told == {"a": ("|S1", ()), "b": ("|S5", ()), "c": ("|u1", ()), "d": ("|u1", (5,)), "e": ("|u1", (1,))}
 
 
 def test_types_are_as_wide_as_their_names_say() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from fieldcal.logs.ulog import aids, streams, units
 from fieldcal.logs.ulog.file import Change, UlogFile
-from fieldcal.logs.ulog.parameters import History, parameters_of, slot_of
+from fieldcal.logs.ulog.parameters import History, correction, corrections, parameters_of, slot_of
 from fieldcal.logs.ulog.records import Topic
 from fieldcal.logs.ulog.rotations import FIRST_OF_MAVLINK, rotation
 from fieldcal.logs.ulog.streams import Clock
@@ -20,6 +20,7 @@ from fieldcal.logs.ulog.write import Rows, write_ulog
 from fieldcal.names import Sensor
 
 LATEST = 4 * 10**15
+AXES = tuple(enumerate("xyz", 1))
 
 
 def log_of(path: Path, *topics: Rows, **options: Any) -> UlogFile:
@@ -114,44 +115,82 @@ def test_samples_of_a_fifo_lie_before_its_stamp(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("at_once", [1, 2, 3, 7, 1000])
-@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("sorted_by_time", [True, False])
 def test_sensors_apart_are_joined_whatever_the_chunks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int, order: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int, sorted_by_time: bool
 ) -> None:
     monkeypatch.setattr(streams, "ROWS_AT_ONCE", at_once)
-    gyro_us, accel_us = np.arange(1000, 1400, 7), np.arange(990, 1500, 10)[::order]
-    parts = [
-        Rows(name, {"timestamp": t_us.astype(np.uint64), **{axis: t_us.astype(np.float32) * (1 + i) for i, axis in enumerate("xyz")}})
-        for name, t_us in (("sensor_gyro", gyro_us), ("sensor_accel", accel_us))
-    ]  # fmt: skip
+
+    def ramp(name: str, t_us: np.ndarray) -> Rows:
+        """Readings that interpolation gives exactly: the time, twice and three times it."""
+        return Rows(name, {"timestamp": t_us.astype(np.uint64), **{a: t_us.astype(np.float32) * i for i, a in AXES}})
+
+    gyro_us, accel_us = np.arange(995, 1400, 7), np.arange(990, 1500, 10)
     path = tmp_path / "a.ulg"
-    write_ulog(path, parts)
-    if order < 0:  # the writer sorts by time; here two rows change places
-        content = path.read_bytes()
-        low, high = (int(t).to_bytes(8, "little") for t in (1190, 1200))
-        path.write_bytes(content.replace(low, b"\xff" * 8).replace(high, low).replace(b"\xff" * 8, high))
+    write_ulog(path, [ramp("sensor_gyro", gyro_us), ramp("sensor_accel", accel_us)])
+    if not sorted_by_time:  # the second and a late accelerometer message change places
+        content = bytearray(path.read_bytes())
+        size = 3 + 2 + 8 + 12
+        places = [content.index(b"D\1\0" + int(t).to_bytes(8, "little")) - 2 for t in (1000, 1440)]
+        first, second = (bytes(content[at : at + size]) for at in places)
+        for at, message in zip(places, (second, first), strict=True):
+            content[at : at + size] = message
+        path.write_bytes(content)
     file = UlogFile(path)
     found = list(streams.joined(file, rows_of(file, "sensor_gyro")[0], rows_of(file, "sensor_accel")[0], Clock()))
-    t_ns = np.concatenate([one.columns["t_ns"] for one in found])
-    assert t_ns.tolist() == (gyro_us * 1000).tolist()
-    if order > 0:
-        accel = np.concatenate([one.columns["accelerometer_y"] for one in found])
-        assert np.allclose(accel, 2 * gyro_us, rtol=1e-6)
-    assert sum(one.left_out + one.outside for one in found) == 0
+    assert np.concatenate([one.columns["t_ns"] for one in found]).tolist() == (gyro_us * 1000).tolist()
+    assert np.allclose(np.concatenate([one.columns["accelerometer_y"] for one in found]), 2 * gyro_us, rtol=1e-6)
+
+
+def test_without_an_accelerometer_or_samples_nothing_is_joined(tmp_path: Path) -> None:
+    empty = imu_topic("sensor_accel", 8, 100.0, n=0)
+    file = log_of(tmp_path / "a.ulg", imu_topic("sensor_gyro", 7, 100.0, n=3), empty)
+    (one,) = streams.joined(file, file.topics[0], file.topics[1], Clock())
+    assert (len(one.columns["t_ns"]), one.outside) == (0, 3)
+    fifo = {"timestamp": stamps(5), "dt": numbers(np.float32, 1), "scale": numbers(np.float32, 1)}
+    fifo |= {"samples": numbers(np.uint8, 0), **{axis: np.ones((1, 4), np.int16) for axis in "xyz"}}
+    file = log_of(tmp_path / "b.ulg", Rows("sensor_gyro_fifo", fifo), imu_topic("sensor_accel", 8, 100.0, n=3))
+    (one,) = streams.joined(file, file.topics[0], file.topics[1], Clock())
+    assert (len(one.columns["t_ns"]), one.outside) == (0, 0)
+
+
+def test_axes_of_a_fifo_are_read_as_far_as_all_are_there(tmp_path: Path) -> None:
+    columns = {"timestamp": stamps(9), "dt": numbers(np.float32, 1), "scale": numbers(np.float32, 1)}
+    columns |= {
+        "samples": numbers(np.uint8, 9),
+        **{axis: np.ones((1, 3 + i), np.int16) for i, axis in enumerate("yxz")},
+    }
+    topic, rows = rows_of(log_of(tmp_path / "a.ulg", Rows("sensor_accel_fifo", columns)), "sensor_accel_fifo")
+    assert streams.readings(rows, topic, Clock())[0].tolist() == [7000, 8000, 9000]
 
 
 def test_rows_of_sensor_combined(tmp_path: Path) -> None:
     columns = {
-        "timestamp": stamps(1000, 2000, 3000, 4000),
+        "timestamp": stamps(0, 2000, 3000, 4000),
         "gyro_rad": triples(4),
         "accelerometer_m_s2": triples(4) + 100,
         "accelerometer_timestamp_relative": numbers(np.int32, 0, 2**31 - 1, 0, 0),
     }
     _, rows = rows_of(log_of(tmp_path / "a.ulg", Rows("sensor_combined", columns)), "sensor_combined")
-    found = streams.combined(rows, Clock(5)).columns
-    assert found["t_ns"].tolist() == [1_000_005, 2_000_005, 3_000_005, 4_000_005]
+    joined = streams.combined(rows, Clock(5))
+    assert (joined.interpolated, joined.left_out, joined.outside) == (0, 0, 0)
+    found = joined.columns
+    assert found["t_ns"].tolist() == [5, 2_000_005, 3_000_005, 4_000_005]
     assert found["gyroscope_z"].tolist() == [2.0, 5.0, 8.0, 11.0]
     assert np.array_equal(found["accelerometer_x"], [100.0, np.nan, 106.0, 109.0], equal_nan=True)
+
+
+def test_an_accelerometers_time_is_told_relative_to_the_gyroscopes(tmp_path: Path) -> None:
+    columns = {
+        "timestamp": stamps(1000, 2000, 3000),
+        "gyro_rad": triples(3),
+        "accelerometer_m_s2": triples(3),
+        "accelerometer_timestamp_relative": numbers(np.int32, -250, -250, -250),
+    }
+    _, rows = rows_of(log_of(tmp_path / "a.ulg", Rows("sensor_combined", columns)), "sensor_combined")
+    joined = streams.combined(rows, Clock())
+    assert (joined.interpolated, joined.outside) == (2, 1)
+    assert np.allclose(joined.columns["accelerometer_x"], [0.75, 3.75])
 
 
 def test_a_reading_that_is_held_counts_once(tmp_path: Path) -> None:
@@ -197,6 +236,7 @@ def test_means_over_intervals(tmp_path: Path) -> None:
         ([Selection(0, 1, 2), Selection(30, 3, 4), Selection(70, 1, 2)], 100, 0),
         ([Selection(0, 1, 2), Selection(30, 1, 4), Selection(90, 1, 2)], 100, 1),
         ([Selection(0, 1, 2), Selection(90, 3, 4)], 80, 0),  # times that do not grow
+        ([Selection(5, 1, 2), Selection(5, 3, 4)], 6, 1),
     ],
 )
 def test_the_unit_chosen_for_the_longest_time(chosen: list[Selection], end_us: int, found: int | None) -> None:
@@ -235,6 +275,107 @@ def test_rawer_readings_are_preferred_down_to_a_rate(tmp_path: Path, raw_hz: flo
     slow = [imu_topic("sensor_gyro", 7, 20.0), imu_topic("sensor_accel", 8, 10.0)]
     (unit,) = units.imus(log_of(tmp_path / "b.ulg", *slow))
     assert unit.stream.rate_hz == 10.0
+    averaged |= {"timestamp": averaged["timestamp"] * np.uint64(5)}
+    (unit,) = units.imus(log_of(tmp_path / "c.ulg", *slow, Rows("vehicle_imu", averaged)))
+    assert unit.stream.name == "vehicle_imu.0"  # none is fast enough: the fastest
+    lacks = {name: column for name, column in averaged.items() if name != "delta_angle_dt"}
+    assert units.imus(log_of(tmp_path / "d.ulg", Rows("vehicle_imu", lacks))) == []
+
+
+def combined_topic(last_us: int, instance: int = 0, **left_out: bool) -> Rows:
+    """sensor_combined every ms up to a time."""
+    t_us = np.arange(1000, last_us + 1, 1000).astype(np.uint64)
+    columns = {"timestamp": t_us, "gyro_rad": triples(len(t_us)), "accelerometer_m_s2": triples(len(t_us))}
+    columns |= {"accelerometer_timestamp_relative": np.zeros(len(t_us), np.int32)}
+    return Rows("sensor_combined", {n: c for n, c in columns.items() if n not in left_out}, instance)
+
+
+def selection_topic(*chosen: tuple[int, int, int]) -> Rows:
+    """sensor_selection: when, gyroscope, accelerometer."""
+    t_us, gyro, accel = zip(*chosen, strict=True)
+    ids = {"gyro_device_id": numbers(np.uint32, *gyro), "accel_device_id": numbers(np.uint32, *accel)}
+    return Rows("sensor_selection", {"timestamp": stamps(*t_us), **ids})
+
+
+RAW = (7, 8)
+
+
+@pytest.mark.parametrize(
+    ("raw", "chosen", "found"),
+    [
+        (None, (), [(0, 0, True, "sensor_combined.0")]),
+        (None, ((0, 9, 10),), [(9, 10, True, "sensor_combined.0")]),
+        (RAW, (), [(7, 8, True, "sensor_gyro.0 and sensor_accel.0")]),
+        (RAW, ((0, 7, 8),), [(7, 8, True, "sensor_gyro.0 and sensor_accel.0")]),
+        (
+            RAW,
+            ((0, 9, 10),),
+            [(9, 10, True, "sensor_combined.0"), (7, 8, False, "sensor_gyro.0 and sensor_accel.0")],
+        ),
+        (RAW, ((0, 7, 11),), [(7, 11, True, "sensor_combined.0")]),  # one gyroscope is in one unit
+        ((0, 0), (), [(0, 0, True, "sensor_gyro.0 and sensor_accel.0")]),
+        (
+            (0, 0),
+            ((0, 0, 5),),
+            [(0, 5, True, "sensor_combined.0"), (0, 0, False, "sensor_gyro.0 and sensor_accel.0")],
+        ),
+        (
+            RAW,
+            ((0, 9, 10), (60_000, 7, 8)),  # until the log ends at 100 ms
+            [(9, 10, True, "sensor_combined.0"), (7, 8, False, "sensor_gyro.0 and sensor_accel.0")],
+        ),
+        (RAW, ((0, 9, 10), (40_000, 7, 8)), [(7, 8, True, "sensor_gyro.0 and sensor_accel.0")]),
+    ],
+)
+def test_sensor_combined_is_of_the_unit_that_the_autopilot_flew_by(
+    tmp_path: Path,
+    raw: tuple[int, int] | None,
+    chosen: tuple[tuple[int, int, int], ...],
+    found: list[tuple[int, int, bool, str]],
+) -> None:
+    topics = [combined_topic(100_000), combined_topic(3000, 1)]
+    topics += [
+        imu_topic(name, number, 200.0) for name, number in zip(("sensor_gyro", "sensor_accel"), raw or (), strict=False)
+    ]
+    topics += [selection_topic(*chosen)] if chosen else []
+    told = units.imus(log_of(tmp_path / "a.ulg", *topics))
+    assert [(u.device_id, u.accelerometer_id, u.primary, u.stream.name) for u in told] == found
+
+
+def test_layouts_that_are_not_whole_are_no_units(tmp_path: Path) -> None:
+    n = 4
+    whole = {"timestamp": stamps(*range(1, n + 1)), "device_id": np.full(n, 7, np.uint32)}
+    whole |= {"samples": np.full(n, 2, np.uint8), "dt": np.ones(n, np.float32), "scale": np.ones(n, np.float32)}
+    whole |= {axis: np.ones((n, 2), np.int16) for axis in "xyz"}
+    mate = Rows("sensor_accel_fifo", whole | {"device_id": np.full(n, 8, np.uint32)})
+
+    def found(columns: Mapping[str, Any]) -> list[str]:
+        file = log_of(tmp_path / "a.ulg", Rows("sensor_gyro_fifo", columns), mate)
+        return [unit.stream.name for unit in units.imus(file)]
+
+    assert found(whole) == ["sensor_gyro_fifo.0 and sensor_accel_fifo.0"]
+    for lacking in ("scale", "dt", "samples", "y"):
+        assert found({name: column for name, column in whole.items() if name != lacking}) == []
+    for other in (np.ones((n, 2), np.float32), np.ones(n, np.int16)):
+        assert found(whole | {"z": other}) == []
+    lacks = combined_topic(5000, accelerometer_timestamp_relative=True)
+    assert units.imus(log_of(tmp_path / "b.ulg", lacks)) == []
+
+
+def test_without_ids_sensors_are_paired_by_instance(tmp_path: Path) -> None:
+    topics = [
+        imu_topic("sensor_gyro", 0, 200.0, 1),
+        imu_topic("sensor_accel", 0, 200.0),
+        imu_topic("sensor_accel", 0, 200.0, 1),
+    ]
+    (unit,) = units.imus(log_of(tmp_path / "a.ulg", *topics))
+    assert unit.stream.name == "sensor_gyro.1 and sensor_accel.1"
+
+
+def test_drivers_that_corrected_have_raw_counts_beside_it(tmp_path: Path) -> None:
+    raw = Rows("sensor_gyro", {"timestamp": stamps(1), "x_raw": numbers(np.int16, 1)})
+    file = log_of(tmp_path / "a.ulg", raw, Rows("sensor_mag", {"timestamp": stamps(1)}))
+    assert [units.corrected_by_driver(topic) for topic in file.topics] == [True, False]
 
 
 def test_sensors_are_paired_by_instance(tmp_path: Path) -> None:
@@ -261,6 +402,7 @@ def test_sensors_are_paired_by_instance(tmp_path: Path) -> None:
         ({"CAL_MAG3_ID": 9, "CAL_MAG3_PRIO": 75}, [9, 7]),
         ({"CAL_MAG4_ID": 9, "CAL_MAG4_PRIO": 75}, [7, 9]),
         ({"CAL_MAG0_ID": 9}, [7, 9]),
+        ({"CAL_MAG0_ID": 9, "CAL_MAG0_PRIO": 1}, [9, 7]),
         ({"CAL_MAG0_ID": 9, "CAL_MAG0_PRIO": 50, "CAL_MAG1_ID": 7, "CAL_MAG1_PRIO": 50}, [7, 9]),
     ],
 )
@@ -270,6 +412,30 @@ def test_the_magnetometer_of_the_highest_priority_is_the_primary_one(
     file = log_of(tmp_path / "a.ulg", imu_topic("sensor_mag", 7, 20.0), imu_topic("sensor_mag", 9, 20.0, 1))
     found = units.magnetometers(file, parameters)
     assert [(u.device_id, u.accelerometer_id, u.primary) for u in found] == [(order[0], 0, True), (order[1], 0, False)]
+
+
+@pytest.mark.parametrize(("number", "primary"), [(0, 7), (1, 1)])
+def test_a_slot_without_a_device_has_no_priority(tmp_path: Path, number: int, primary: int) -> None:
+    file = log_of(tmp_path / "a.ulg", imu_topic("sensor_mag", 7, 20.0), imu_topic("sensor_mag", number, 20.0, 1))
+    found = units.magnetometers(file, {"CAL_MAG0_ID": number, "CAL_MAG0_PRIO": 75})
+    assert next(unit.device_id for unit in found) == primary
+
+
+def test_the_first_calibrated_magnetometer_is_the_primary_one(tmp_path: Path) -> None:
+    def calibrated(device_id: int, instance: int) -> Rows:
+        columns = {"timestamp": stamps(*range(1, 9)), "device_id": np.full(8, device_id, np.uint32)}
+        return Rows("vehicle_magnetometer", columns | {"magnetometer_ga": triples(8)}, instance)
+
+    topics = [calibrated(9, 0), calibrated(7, 1)]
+    raw = [imu_topic("sensor_mag", 7, 20.0), imu_topic("sensor_mag", 9, 20.0, 1)]
+    for more, names in (
+        ([], ["vehicle_magnetometer.0", "vehicle_magnetometer.1"]),
+        (raw, ["sensor_mag.1", "sensor_mag.0"]),
+    ):
+        found = units.magnetometers(log_of(tmp_path / "a.ulg", *topics, *more), {"CAL_MAG0_ID": 7, "CAL_MAG0_PRIO": 9})
+        assert [(unit.device_id, unit.primary) for unit in found] == [(9, True), (7, False)]
+        assert [unit.stream.name for unit in found] == names
+    assert units.magnetometers(log_of(tmp_path / "b.ulg", combined_topic(5000)), {}) == []
 
 
 @pytest.mark.parametrize(("ids", "count"), [((7, 9), 2), ((7, 7), 2), ((0, 0), 2), ((7, 7, 7), 3)])
@@ -292,16 +458,27 @@ def test_a_raw_magnetometer_is_preferred_down_to_a_rate(tmp_path: Path, raw_hz: 
     assert (unit.stream.name, unit.primary) == (name, True)
 
 
+@pytest.mark.filterwarnings("error")
 def test_a_magnetometer_held_in_sensor_combined(tmp_path: Path) -> None:
-    for relatives, rate in (((0, -10_000, 0, -10_000), 50.0), ((0, -10_000), 0.0)):
+    for relatives, rate in (
+        ((0, -10_000, 0, -10_000), 50.0),
+        ((0, -10_000), 0.0),
+        ((0, -10_000, 0), 50.0),
+        ((0, -5000, -20_000), 0.0),  # times that do not grow
+        ((2**31 - 1, 2**31 - 1), 0.0),
+    ):
         n = len(relatives)
         columns = {
-            "timestamp": stamps(*(10_000 * i + 10_000 for i in range(n))),
+            "timestamp": stamps(*(10_000 * i + 1 for i in range(n))),
             "magnetometer_ga": triples(n),
             "magnetometer_timestamp_relative": numbers(np.int32, *relatives),
         }
         (unit,) = units.magnetometers(log_of(tmp_path / "a.ulg", Rows("sensor_combined", columns)), {})
         assert (unit.device_id, unit.stream.rate_hz, unit.primary) == (0, rate, True)
+        beside = log_of(tmp_path / "b.ulg", Rows("sensor_combined", columns), imu_topic("sensor_mag", 9, 20.0))
+        assert [unit.stream.name for unit in units.magnetometers(beside, {})] == ["sensor_mag.0"]
+        del columns["magnetometer_timestamp_relative"]
+        assert units.magnetometers(log_of(tmp_path / "c.ulg", Rows("sensor_combined", columns)), {}) == []
 
 
 def test_ids_of_a_topic(tmp_path: Path) -> None:
@@ -309,6 +486,8 @@ def test_ids_of_a_topic(tmp_path: Path) -> None:
     file = log_of(tmp_path / "a.ulg", Rows("a", columns), Rows("b", {"timestamp": stamps(1)}))
     assert (units.first_id(file, file.topics[0]), units.usual_id(file, file.topics[0])) == (5, 6)
     assert (units.first_id(file, file.topics[1]), units.usual_id(file, file.topics[1])) == (0, 0)
+    file = log_of(tmp_path / "b.ulg", imu_topic("a", 5, 10.0, n=0), imu_topic("b", 5, 10.0))
+    assert (units.first_id(file, file.topics[0]), units.usual_id(file, file.topics[0])) == (0, 0)
 
 
 # what else is logged -------------------------------------------------------------------------------------------------
@@ -339,6 +518,18 @@ def test_the_date_by_a_fix(tmp_path: Path, fix: int, boot_us: int, utc_us: int, 
     assert (None if found is None else found.offset_ns) == ((utc_us - boot_us) * 1000 if known else None)
 
 
+def test_of_the_date_is_told_how_far_fixes_differ(tmp_path: Path) -> None:
+    columns = {
+        "timestamp": stamps(1000, 2000, 3000, 4000),
+        "time_utc_usec": stamps(*(2 * YEAR_2001_US + t for t in (1000, 12_000, 3000 - 25_000, 99_000))),
+        "fix_type": numbers(np.uint8, 3, 3, 3, 1),
+    }
+    found = aids.epoch(log_of(tmp_path / "a.ulg", Rows("sensor_gps", columns)))
+    assert found is not None
+    assert found.offset_ns == 2 * YEAR_2001_US * 1000
+    assert found.source == "sensor_gps, 3 fixes, -25 to +10 ms about their median"
+
+
 @pytest.mark.parametrize(
     ("noted", "known"),
     [(YEAR_2001_US, False), (YEAR_2001_US + 1, True), (LATEST - 1, True), (LATEST, False)],
@@ -361,7 +552,13 @@ def test_velocities_count_where_they_are_valid(tmp_path: Path) -> None:
         "s_variance_m_s": numbers(np.float32, 1, 2, 4),
     }
     file = log_of(tmp_path / "a.ulg", Rows("vehicle_gps_position", columns))
-    found = dict(aids.gnss_batches(file, Clock(3)))
+    batches = list(aids.gnss_batches(file, Clock(3)))
+    found = dict(batches)
+    newer = {"latitude_deg": stamps(1) * 47.5, "longitude_deg": stamps(1) * 8.5, "altitude_msl_m": stamps(1) * 430.25}
+    newer |= {"timestamp": stamps(9), "fix_type": numbers(np.uint8, 3)}
+    other = log_of(tmp_path / "b.ulg", Rows("vehicle_gps_position", newer), Rows("vehicle_gps_position", newer, 1))
+    (((_, one),)) = list(aids.gnss_batches(other, Clock()))
+    assert [column.tolist() for column in one.values()] == [[9000], [47.5], [8.5], [430.25]]
     assert found["position"]["t_ns"].tolist() == [2003, 3003]
     place = [found["position"][name][0] for name in ("latitude_deg", "longitude_deg", "altitude_m")]
     assert np.allclose(place, [47.1234567, 8.1234567, 430.25], rtol=1e-12)
@@ -382,6 +579,13 @@ def test_frames_of_poses_whose_z_is_down(tmp_path: Path, field: str, usable: tup
     assert found["t_ns"].tolist() == [1000 * (i + 1) for i in usable]
     assert [[found[f"q{axis}"][i] for axis in "wxyz"] for i in (0, 1)] == [q[i].tolist() for i in usable]
     assert found["pz_m"].tolist() == [3.0 * i + 2 for i in usable]
+
+
+def test_a_position_in_three_fields(tmp_path: Path) -> None:
+    columns = {"timestamp": stamps(1), "q": np.ones((1, 4), np.float32), **{a: numbers(np.float32, i) for i, a in AXES}}
+    topic, rows = rows_of(log_of(tmp_path / "a.ulg", Rows("vehicle_mocap_odometry", columns)), "vehicle_mocap_odometry")
+    found, _ = aids.pose_columns(topic, rows, Clock())
+    assert [found[f"p{axis}_m"].tolist() for axis in "xyz"] == [[1.0], [2.0], [3.0]]
 
 
 def test_the_pose_with_the_most_messages(tmp_path: Path) -> None:
@@ -440,16 +644,47 @@ def test_the_slot_of_a_device(values: Mapping[str, float], device_id: int, slot:
 
 
 def test_states_begin_with_the_log_and_with_what_was_set_of_it() -> None:
-    changes = [Change(5, "A_X", 1.0), Change(5, "A_Y", 2.0), Change(6, "B_X", 3.0), Change(7, "A_X", 4.0)]
-    history = History({"A_X": 0.0}, changes, 3)
-    assert list(history.states("A_")) == [
-        (3, {"A_X": 0.0}),
-        (5, {"A_X": 1.0, "A_Y": 2.0}),
-        (7, {"A_X": 4.0, "A_Y": 2.0, "B_X": 3.0}),
+    """What is set at one time is set at once, whatever stands last of it."""
+    changes = [
+        Change(5, "A_X", 1.0),
+        Change(5, "A_Y", 2.0),
+        Change(5, "B_Y", 0.5),
+        Change(6, "B_X", 3.0),
+        Change(7, "A_X", 4.0),
     ]
+    history = History({"A_X": 0.0}, changes, 3)
+    at_5, at_6 = {"A_X": 1.0, "A_Y": 2.0, "B_Y": 0.5}, {"A_X": 1.0, "A_Y": 2.0, "B_Y": 0.5, "B_X": 3.0}
+    at_7 = at_6 | {"A_X": 4.0}
+    assert list(history.states("A_")) == [(3, {"A_X": 0.0}), (5, at_5), (7, at_7)]
+    assert list(history.states("B_")) == [(3, {"A_X": 0.0}), (5, at_5), (6, at_6)]
     assert [at for at, _ in history.states("A_", "B_")] == [3, 5, 6, 7]
-    assert history.last == {"A_X": 4.0, "A_Y": 2.0, "B_X": 3.0}
+    assert history.last == at_7
     assert (History({}).start_us, History({}).release) == (0, None)
+
+
+def test_what_is_set_as_the_log_begins_is_its_first_correction() -> None:
+    values = {"CAL_ACC0_ID": 5.0, "CAL_ACC0_XOFF": 1.0}
+    changes = [Change(3, "CAL_ACC0_XOFF", 2.0), Change(4, "CAL_ACC0_XOFF", 3.0), Change(4, "CAL_GYRO0_XOFF", 3.0)]
+    found = corrections(Sensor.ACCELEROMETER, 5, History(values, changes, 3), offset_ns=7)
+    assert [(one.from_ns, one.offset[0]) for one in found] == [(3007, -2.0), (4007, -3.0)]
+
+
+@pytest.mark.parametrize(
+    ("mounted", "turned"), [({}, True), ({"CAL_MAG0_ROT": -1.0}, True), ({"CAL_MAG0_ROT": 0.0}, False)]
+)
+def test_an_external_magnetometer_may_be_mounted_straight_on_a_turned_board(
+    mounted: Mapping[str, float], turned: bool
+) -> None:
+    found = correction(Sensor.MAGNETOMETER, 5, {"CAL_MAG0_ID": 5.0, "SENS_BOARD_ROT": 4.0, **mounted})
+    assert np.allclose(found.matrix, np.diag([-1.0, -1.0, 1.0]) if turned else np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize(("degc", "slope"), [(9.9, 0.0), (10.0, 2.0), (40.0, 2.0), (40.1, 0.0)])
+def test_a_thermal_offset_slopes_up_to_its_limits(degc: float, slope: float) -> None:
+    values = {"TC_A_ENABLE": 1.0, "TC_A0_ID": 5.0, "TC_A0_TMIN": 10.0, "TC_A0_TMAX": 40.0, "TC_A0_X1_0": 2.0}
+    found = correction(Sensor.ACCELEROMETER, 5, values, degc)
+    assert found.offset_per_degc == (-slope, 0.0, 0.0)
+    assert found.offset[0] == pytest.approx(-2.0 * (min(max(degc, 10.0), 40.0) - 25.0), abs=1e-12)
 
 
 def test_parameters_of_a_sensor_are_those_that_there_are() -> None:

@@ -143,7 +143,7 @@ def header_place(texts: list[str], separator: str | None, decimal: str | None) -
     data = texts[1:_LINES_LOOKED_AT]
     first = separator or _separator(texts[0], data)
     fields = len(cells_of(texts[0], first))
-    if not data or sum(_is_row(line, first, fields, decimal) for line in data) > len(data) // 2:
+    if sum(_is_row(line, first, fields, decimal) for line in data) > len(data) // 2:
         return 0
     for place in range(1, len(texts) - 1):
         for candidate in (separator,) if separator else (*SEPARATORS, WHITESPACE):

@@ -30,7 +30,7 @@ def instance_column(names: tuple[str, ...], taken: set[int]) -> int | None:
 def interleaved(cells: pl.Series) -> list[str]:
     """The names of the IMUs whose rows alternate, by the cells of the column that tells them apart; else none."""
     present = cells.str.strip_chars().drop_nulls()
-    values = present.unique(maintain_order=True).to_list()
+    values = present.unique().to_list()
     if len(present) < LEAST_ROWS or not 2 <= len(values) <= MOST_UNITS:
         return []
     switches = int((present != present.shift(1)).sum())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import bz2
-import mmap
+from mmap import mmap
 
 from fieldcal.logs.mcap.chunks import CHUNK_CAP_BYTES, TOTAL_CAP_BYTES, TOTAL_CAP_RATIO, unpack_lz4
 from fieldcal.logs.rosbag1.records import CHUNK, OPCODES, Buffer, Damage, Record, read_record
@@ -16,7 +16,7 @@ _FARTHEST_FIELD = 64
 class ChunkOpener:
     """Opens chunks; those that grow beyond their ratio draw on what all together may cost."""
 
-    def __init__(self, buffer: mmap.mmap) -> None:
+    def __init__(self, buffer: Buffer) -> None:
         self._buffer = buffer
         self._budget = TOTAL_CAP_BYTES
 
@@ -48,7 +48,7 @@ class ChunkOpener:
         return content
 
 
-def next_chunk(buffer: mmap.mmap, position: int, limit: int) -> int | None:
+def next_chunk(buffer: bytes | mmap, position: int, limit: int) -> int | None:
     """Where the next record of a chunk begins at or behind `position`."""
     field = _OPCODE_FIELD + bytes([CHUNK])
     found = buffer.find(field, position, limit)

@@ -10,6 +10,7 @@ Source: PX4-Autopilot, src/lib/sensor_calibration, src/modules/sensors/temperatu
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -63,11 +64,11 @@ class History:
         """(from when, in µs, all values): at the start, and whenever a parameter with one of these prefixes was set."""
         values = dict(self.initial)
         yield self.start_us, dict(values)
-        for number, change in enumerate(self.changes):
-            values[change.name] = change.value
-            more = self.changes[number + 1 : number + 2]
-            if change.name.startswith(prefixes) and not (more and more[0].t_us == change.t_us):
-                yield change.t_us, dict(values)
+        for t_us, group in itertools.groupby(self.changes, key=lambda change: change.t_us):
+            together = {change.name: change.value for change in group}
+            values |= together
+            if any(name.startswith(prefixes) for name in together):
+                yield t_us, dict(values)
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ def fits(kind: int, payload: bytes) -> bool:
     if kind in (PARAMETER, PARAMETER_DEFAULT):
         return _keyed(payload, int(kind == PARAMETER_DEFAULT), _VALUE)
     if kind == SUBSCRIPTION:
-        return len(payload) > 3 and _NAME.fullmatch(payload[3:]) is not None
+        return _NAME.fullmatch(payload[3:]) is not None
     if kind == TEXT:
         return len(payload) >= 9 and payload[:1] in b"01234567" and b"\0" not in payload[9:]
     if kind == TAGGED_TEXT:
@@ -155,16 +155,15 @@ def row_kind(name: str, formats: Mapping[str, str], depth: int = 0) -> tuple[np.
     while depth == 0 and fields and fields[-1].name.startswith("_padding"):
         padding += fields.pop().count or 1
     for field in fields:
-        count = 1 if field.count is None else field.count
-        if not 0 < count <= MOST_ELEMENTS or field.name in names:
+        if field.name in names or not (field.count is None or 0 < field.count <= MOST_ELEMENTS):
             raise ValueError(f"format {name} has an impossible field {field.name}")
         if field.type_name == "char" and field.count is not None:
-            kind: np.dtype = np.dtype(f"S{count}")
+            kind: np.dtype = np.dtype(f"S{field.count}")
         else:
             basic = BASIC_TYPES.get(field.type_name)
             kind = np.dtype(basic) if basic else row_kind(field.type_name, formats, depth + 1)[0]
             if field.count is not None:
-                kind = np.dtype((kind, (count,)))
+                kind = np.dtype((kind, (field.count,)))
         names.append(field.name)
         kinds.append(kind)
     rows = np.dtype({"names": names, "formats": kinds})
@@ -175,7 +174,7 @@ def row_kind(name: str, formats: Mapping[str, str], depth: int = 0) -> tuple[np.
 
 def _keyed(payload: bytes, before: int, allowed: Collection[str] = BASIC_TYPES) -> bool:
     """Whether a key of one of the allowed types and a value of its size make up the payload."""
-    if len(payload) < before + 2:
+    if len(payload) <= before:
         return False
     split = before + 1 + payload[before]
     match = _KEY.fullmatch(payload[before + 1 : split])

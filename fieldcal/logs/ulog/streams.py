@@ -54,8 +54,6 @@ def stamps_us(rows: Rows) -> NDArray[np.uint64]:
 
 def vector(rows: Rows, *names: str) -> Values:
     """Readings (n, 3) from one field of three numbers, or from three fields."""
-    if len(names) == 1:
-        return rows[names[0]].astype(np.float64)
     return np.column_stack([rows[name] for name in names]).astype(np.float64)
 
 
