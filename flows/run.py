@@ -29,8 +29,10 @@ def run_night(
     progress: Watcher | None = None,
     **where: str | None,
 ) -> NightDocument:
-    """Run the flow `nightly`, or `session` for that folder of the archive; its JSON, with how long it took. Where nothing
-    is new there is no flow to run, and no server is started; one that the environment names hears of the night.
+    """Run the flow `nightly`, or `session` for that folder of the archive; its JSON, with how long it took.
+
+    Where nothing is new no server is started and no flow runs, unless the environment names a server: it hears of the
+    night.
 
     `where` may hold `runner` and `scheduler` (`runners`). `seconds` is the whole duration, `server_seconds` what
     of it went into importing Prefect and into waiting for its server once the night was planned, `stage_seconds` the

@@ -25,7 +25,7 @@ def end_night(night: Night, outcomes: Sequence[Outcome], workers: int) -> tuple[
 
 
 def quiet_night(night: Night, watcher: Watcher | None, workers: int) -> NightDocument:
-    """Carry out a night that `has_work` says there is none in: time alone may have made something new, which is told."""
+    """Carry out a night without work (`Night.has_work`): time alone may have made something new, which is told."""
     with telling(night) as tell:
         if watcher is not None:
             watcher.planned(len(night.plan.jobs), 0, len(night.plan.done))
