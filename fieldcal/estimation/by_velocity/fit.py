@@ -198,8 +198,9 @@ class _Fit:
         self.sign = float(np.sign(readings.gravity_mps2))
         grid = grid_of(readings, self.knots, LAG_S)
         path = self._integrated(grid, values)
-        lit = (path.count > 0) & self.knots.joined & with_field
-        self.setting = Setting(self.knots, epochs, gravity, np.asarray(readings.field_ned, dtype=float), lit)
+        self.setting = Setting(
+            self.knots, epochs, gravity, np.asarray(readings.field_ned, dtype=float), self._lit(path, values)
+        )
         q = attitudes(self.setting, path, values.get("magnetometer"))
         self.state = State(q, velocities_at_knots(self.setting), values)
         self.signs: list[Array] = []
@@ -217,17 +218,28 @@ class _Fit:
         triads = values["gyroscope"], values["drift"], values["accelerometer"]
         return integrate(grid, *triads, self.sign, self.middle_s)
 
+    def _lit(self, path: Integrated, values: Mapping[str, Array]) -> np.ndarray:
+        """Intervals with readings of the magnetometer that count: another lag puts readings into other intervals."""
+        lit: np.ndarray = (path.count > 0) & self.knots.joined & ("magnetometer" in values)
+        return lit
+
     def run(self) -> VelocityFit:
         rng = np.random.default_rng(0)
         for iteration in range(1, MOST_ITERATIONS + 1):
             grid = grid_of(self.readings, self.knots, self.state.lag_s)
             path = self._integrated(grid, self.state.values)
+            self.setting = replace(self.setting, lit=self._lit(path, self.state.values))
             rows = rows_of(self.setting, self.state, path, self.levels, self.layout)
             if not self.signs:
                 self.signs = [rng.choice([-1.0, 1.0], size=one.residual.shape) for one in rows]
+                everywhere = rng.choice([-1.0, 1.0], size=(len(self.setting.lit), 3))
+                for k, one in enumerate(rows[2:], 2):
+                    everywhere[one.knot] = self.signs[k]
+                    self.signs[k] = everywhere  # intervals that have readings at another lag
                 if len(rows) > 2 and len(rows[2].knot):
                     self.levels = replace(self.levels, field=float(robust_sigma(rows[2].residual)) ** 2)
                     continue
+            signs = [*self.signs[:2], *(own[one.knot] for own, one in zip(self.signs[2:], rows[2:], strict=True))]
             weight = robust_weights(rows)
             known = self.known, self._pulled()
             score: Array = np.zeros(len(self.known))
@@ -235,7 +247,7 @@ class _Fit:
                 shares = self.least[TURN] / self.levels.turn, self.least[PUSH] / self.levels.push
                 score = noise_in_readings(rows[0], self.state, self.layout, *shares)
             try:
-                solved = solve(rows, weight, len(self.knots.offset), known, score, self.signs)
+                solved = solve(rows, weight, len(self.knots.offset), known, score, signs)
             except np.linalg.LinAlgError as error:
                 raise _diverged() from error
             sd = np.sqrt(np.diagonal(solved.covariance))
@@ -244,7 +256,7 @@ class _Fit:
             self.state = moved(self.state, solved, path, self.layout, self.setting.gravity)
             damping = 1.0 if iteration <= UNDAMPED_ITERATIONS else DAMPING
             self.levels, change = renewed(
-                self.levels, self.least, damping, rows, weight, self.signs, solved, self.knots.offset
+                self.levels, self.least, damping, rows, weight, signs, solved, self.knots.offset
             )
             if np.max(np.abs(solved.theta) / sd) < CONVERGED_SD and change < CONVERGED_LEVEL:
                 return self._result(rows, weight, solved, path, iteration)

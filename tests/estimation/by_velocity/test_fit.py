@@ -14,6 +14,7 @@ import fieldcal.estimation.by_velocity.start as start
 from fieldcal.errors import UnusableFlight
 from fieldcal.estimation.by_velocity.fit import FEWEST_EPOCHS
 from fieldcal.estimation.by_velocity.information import observed
+from fieldcal.estimation.by_velocity.known import LAG_S
 from fieldcal.estimation.by_velocity.problem import place_knots
 from fieldcal.estimation.by_velocity.walk import walk_density
 from fieldcal.geometry.rotation import angle_between
@@ -266,6 +267,21 @@ def test_a_magnetometer_takes_part_with_twenty_readings(readings: int, taken: bo
     assert ("magnetometer" in fit.layout) == taken
     assert fit.setting.lit.sum() == (readings if taken else 0)
     assert taken or fit.field_weight == 1.0
+
+
+@pytest.mark.parametrize("seed", range(20, 25))
+def test_readings_count_in_the_interval_that_the_lag_found_puts_them_in(seed: int) -> None:
+    flight = short_flight("lively", seed)
+    # Once a second, between where an epoch is at the lag of the start and where it is at the true one.
+    at = np.searchsorted(flight.t, flight.gnss_t[5:-5:5] - 0.5 * (LAG_S + flight.gnss_lag_s))
+    slow = np.full((len(flight.t), 3), np.nan)
+    slow[at] = flight.counts["magnetometer"][at]
+    fit = fitted(flight, with_readings(flight, magnetometer=slow))
+    ends = fit.setting.knots.offset - fit.state.lag_s
+    assert np.flatnonzero(fit.setting.lit) == pytest.approx(np.searchsorted(ends, flight.t[at]) - 1)
+    found = errors(flight, fit)
+    assert all(np.all(np.abs(error) < 4.0 * sd) for error, sd in found.values())
+    assert np.all(found["magnetometer scale"][1] < 0.02)
 
 
 def test_hover_tells_no_scale_of_an_accelerometer() -> None:
