@@ -87,20 +87,20 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): "counts are whole",
     (
         "estimation.pooled.unit",
-        "Pooled.rates",
+        "Pooled._each_alone",
         "size = np.sqrt(np.maximum(np.diagonal(n)[:d], 1e-300))",
         "1e-300 → 1.1000000000000002e-300",
     ): GUARD,
     (
         "estimation.pooled.unit",
-        "Pooled.rates",
+        "Pooled._each_alone",
         "inverse = np.linalg.pinv(n[:d, :d] / np.outer(size, size), rcond=1e-10, hermitian=True)",
         "1e-10 → 1.1000000000000001e-10",
     ): RCOND,
     (
         "estimation.pooled.unit",
-        "Pooled.rates",
-        "if information[i] > 1e-9 * alone[i]:",
+        "Pooled._each_alone",
+        "for i in np.flatnonzero(information > 1e-9 * alone)",
         "1e-09 → 1.1000000000000001e-09",
     ): RCOND,
     (
@@ -235,7 +235,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): START,
     (
         "estimation.pooled.unit",
-        "Pooled.rates",
+        "Pooled._each_alone",
         "if np.isfinite(now.covariance[at, at]) and now.covariance[at, at] > 0.0:",
         "> → >=",
     ): NEVER_MET,

@@ -191,8 +191,8 @@ def of_pairs(within: Array, slope: float, own: float) -> float:
 
 
 def is_bent(series: Array, scatter: float) -> bool:
-    """Whether a series (m, 4) of day, temperature, value and variance bends with temperature by what it scatters itself,
-    whatever `scatter` is taken to be beside the variances: by Student's t of the coefficient of the square."""
+    """Whether a series (m, 4) of day, temperature, value and variance bends with temperature by its own scatter:
+    Student's t of the coefficient of the square. `scatter` beside the variances weighs the sessions alone."""
     _, warmth, value, variance = series.T
     if (freedom := len(value) - 3) < 1:
         return False

@@ -294,8 +294,8 @@ def state_of(
     days: float = 0.0,
     bent: tuple[int, ...] = (),
 ) -> Known:
-    """A flight's equations as those of the state: the constants at its temperature are constants plus slopes, those that
-    are bent plus bends, and `days` after the last session those that drift plus rates."""
+    """A flight's equations as those of the state: the constants at its temperature are constants plus slopes, those
+    `bent` plus bends, and `days` after the last session those that drift plus rates."""
     own = flight.equations
     warmth = usual_degc if flight.warmth_degc is None else flight.warmth_degc
     p, s, d = len(names), len(sloped), len(drifting)
@@ -439,8 +439,8 @@ def surest_drift(found: Pooled, freedom: Array) -> tuple[float, int] | None:
 
 
 def surest_bend(found: Pooled, freedom: Array) -> tuple[float, int] | None:
-    """The zero whose bend with temperature is the surest, if one's is and moves it, amid the temperatures flown, off the
-    straight line between their ends by more than a session scatters, and the logarithm of its chance."""
+    """The zero whose bend with temperature is the surest, if one's is and has it, amid the temperatures flown, further
+    from the straight line between their ends than a session scatters, and the logarithm of its chance."""
     out = {one.flight for one in found.left_out}
     flown = [
         (flight.session, flight.warmth_degc)
