@@ -222,4 +222,3 @@ def test_a_series_is_bent_where_a_polynomials_own_scatter_says_so(share: float, 
     value += (share * limit - square) * warmth**2
     series = np.column_stack([np.arange(9.0), warmth, value, variance])
     assert is_bent(series, scatter) == (share > 1.0)
-    assert not is_bent(series[:3], scatter)
