@@ -144,6 +144,18 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): NEVER_MET,
     (
         "estimation.pooled.unit",
+        "surest_bend",
+        "if abs(bend.per_degc2) * half**2 > np.sqrt(found.scatter[place])",
+        "> → >=",
+    ): NEVER_MET,
+    (
+        "estimation.pooled.unit",
+        "surest_bend",
+        "return surest if surest is not None and surest[0] < np.log(FALSE_ALARMS / zeros) else None",
+        "< → <=",
+    ): NEVER_MET,
+    (
+        "estimation.pooled.unit",
         "jumps",
         "size = np.sqrt(np.maximum(np.diagonal(together.information), 1e-300))",
         "1e-300 → 1.1000000000000002e-300",
@@ -235,7 +247,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): START,
     (
         "estimation.pooled.unit",
-        "Pooled._each_alone",
+        "Pooled.rates",
         "if np.isfinite(now.covariance[at, at]) and now.covariance[at, at] > 0.0:",
         "> → >=",
     ): NEVER_MET,

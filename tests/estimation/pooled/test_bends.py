@@ -93,6 +93,29 @@ def test_the_bend_of_a_straight_zero_is_that_of_least_squares_in_which_it_is_ben
     assert bend.z == pytest.approx(state[11] / np.sqrt(covariance[11, 11]), rel=RTOL)
 
 
+def test_zeros_of_two_axes_are_each_least_squares_by_itself() -> None:
+    """That share nothing: both bent, and each asked where the other is bent."""
+    other, other_slope = ("gyroscope", "zero", "y"), ("gyroscope", "zero_per_degc", "y")
+    (one, *told), (two, *told_two) = small(5), small(6)
+    flights = []
+    for a, b in zip(one.flights, two.flights, strict=True):
+        right = np.r_[a.equations.right, b.equations.right]
+        equations = NormalEquations((ZERO, SLOPE, other, other_slope), np.zeros(4), right, np.eye(4))
+        flights.append(replace(a, equations=equations))
+    unit, expected = Unit(tuple(flights), DAY), [dense(*own, bent=True) for own in (told, told_two)]
+    both = smoothed(unit, KINDS, (), (), (), (1, 0))
+    for place, (state, covariance) in enumerate(expected):
+        at = np.zeros(12)
+        at[[4, 10, 11]] = 1.0, 7.0, 49.0
+        value, variance = both.at().of(both.combination(place, 7.0))
+        assert (value, variance) == (pytest.approx(at @ state, rel=RTOL), pytest.approx(at @ covariance @ at, rel=RTOL))
+        assert both.bend_of()[place] == pytest.approx(state[11], rel=RTOL)
+        bends = smoothed(unit, KINDS, (), (), (), (1 - place,)).bends()
+        assert list(bends) == [place]
+        assert bends[place].per_degc2 == pytest.approx(state[11], rel=RTOL)
+        assert bends[place].sd == pytest.approx(np.sqrt(covariance[11, 11]), rel=RTOL)
+
+
 def curve(warmth: Array, value: Array, scatter: float, session: Array | None = None) -> Unit:
     """A zero that each flight knows far better than it scatters, beside a gain and a lever that nothing bends."""
     names = (ZERO, GAIN, LEVER)
@@ -143,6 +166,21 @@ def test_a_bend_is_named_where_one_in_three_hundred_units_would_have_one(share: 
     size = share * float(norm.isf(0.5 * 0.003)) * sd
     found = smoothed(curve(warmth, size * warmth**2, 1.0), only_zero(1.0), (), (), ())
     assert (surest_bend(found, np.full(3, 1e8)) is not None) == (share > 1.0)
+
+
+@pytest.mark.parametrize("share", [0.995, 1.005])
+def test_a_second_bend_is_as_sure_as_the_first_had_to_be(share: float) -> None:
+    """One among two zeros."""
+    warmth, other = np.linspace(-20.0, 10.0, 9), ("gyroscope", "zero", "y")
+    sd = np.sqrt(np.linalg.inv(np.vander(warmth, 3).T @ np.vander(warmth, 3))[0, 0])
+    size = share * float(norm.isf(0.5 * 0.003 / 2)) * sd
+    flights = [
+        Flight(NormalEquations((ZERO, other), np.zeros(2), 1e6 * np.array([w**2, size * w**2]), 1e6 * np.eye(2)), k, w)
+        for k, w in enumerate(map(float, warmth))
+    ]
+    found = smoothed(Unit(tuple(flights), np.arange(9.0)), only_zero(1.0), (), (), (), (0,))
+    told = surest_bend(found, np.full(2, 1e8))
+    assert (told is not None and told[1] == 1) == (share > 1.0)
 
 
 SESSIONS, PLACE, PER_DEGC2 = 12, NAMES.index(ZERO), 4e-5
@@ -198,6 +236,16 @@ def test_bends_are_no_scatter() -> None:
     kinds = strengths(units)
     assert 0.5 < np.sqrt(kinds[ZERO[:2]].scatter) / SCATTER[ZERO[:2]] < 1.6
     assert all(found.bent == (found.names.index(ZERO),) for found in (pool(unit, kinds) for unit in units))
+
+
+def test_five_temperatures_tell_that_a_bend_is_no_scatter() -> None:
+    """Twelve units, of whose five values each a curve takes three; as lines, each session would be a series anew."""
+    units = []
+    for seed in range(12):
+        rng = np.random.default_rng([44, seed])
+        warmth = rng.permutation([-20.0, -12.0, -5.0, 4.0, 10.0])
+        units.append(curve(warmth, warmth**2 + 0.3 * rng.normal(size=5), 1.0))
+    assert 0.1 < strengths(units)[ZERO[:2]].scatter / 0.3**2 < 2.0
 
 
 def test_flights_of_a_session_differ_by_slope_alone_where_the_zero_bends() -> None:
