@@ -75,6 +75,18 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("estimation.pooled.strengths", "_starts", "times = TIMES if with_slope else TIMES[:1]", "1 → 2"): START,
     (
         "estimation.pooled.strengths",
+        "is_bent",
+        "return bool(log_beyond_either_way(told[2] / np.sqrt(max(left, 1e-300) / freedom), freedom) < np.log(BENT))",
+        "< → <=",
+    ): NEVER_MET,
+    (
+        "estimation.pooled.strengths",
+        "is_bent",
+        "return bool(log_beyond_either_way(told[2] / np.sqrt(max(left, 1e-300) / freedom), freedom) < np.log(BENT))",
+        "1e-300 → 1.1000000000000002e-300",
+    ): GUARD,
+    (
+        "estimation.pooled.strengths",
         "unlikely",
         "return float(above if above > 0.0 else FEW * (above + EXPECTED_SHARE**2 / ratio - 1.0))",
         "> → >=",

@@ -191,12 +191,12 @@ def of_pairs(within: Array, slope: float, own: float) -> float:
 
 
 def is_bent(series: Array, scatter: float) -> bool:
-    """Whether a series (m, 4), m > 3, of day, temperature, value and variance bends with temperature by its own scatter:
+    """Whether a series (m, 4), m > 3, of day, temperature, value and variance bends with temperature by its scatter:
     Student's t of the coefficient of the square. `scatter` beside the variances weighs the sessions alone."""
     _, warmth, value, variance = series.T
     freedom = len(value) - 3
-    root = 1.0 / np.sqrt(variance + scatter)
-    axes = np.linalg.qr(np.vander(warmth / np.abs(warmth).max(), 3, increasing=True) * root[:, None])[0]
+    root = (variance + scatter) ** -0.5
+    axes = np.linalg.qr(np.vander(warmth, 3, increasing=True) * root[:, None])[0]
     told = axes.T @ (value * root)
     left = float(np.sum((value * root - axes @ told) ** 2))
     return bool(log_beyond_either_way(told[2] / np.sqrt(max(left, 1e-300) / freedom), freedom) < np.log(BENT))
