@@ -390,6 +390,16 @@ CURVE_PER_DEGC2, CURVE_PER_DEGC2_SD, CURVE_PER_DEGC3, CURVE_PER_DEGC3_SD = (
         ("_sd", f"standard deviation of curve_per_degc{power}"),
     )
 )
+CURVE_WITH_VALUE = Column(
+    "curve_with_value",
+    _F64,
+    "square of column unit per degC^2",
+    "covariance of curve_per_degc2 with value_at_25degc: w degC above 25 the variance of the value has 2 w^2 of it, "
+    "2 w^3 of curve_with_slope and w^4 curve_per_degc2_sd^2 beside that of the line",
+)
+CURVE_WITH_SLOPE = Column(
+    "curve_with_slope", _F64, "square of column unit per degC^3", "covariance of curve_per_degc2 with slope_per_degc"
+)
 SLOPE_PER_DAY = Column("slope_per_day", _F64, "column unit per day", "change with time")
 SLOPE_PER_DAY_SD = Column("slope_per_day_sd", _F64, "column unit per day", "standard deviation of slope_per_day")
 LAST_Z = Column(

@@ -62,6 +62,11 @@ CHANGES: tuple[Change, ...] = (
     # Some of version 2 have these already.
     *(Change(table, 3, _ORDER) for table in ("calibration", "fit", "sync", "run")),
     Change("pooled", 2, dict.fromkeys(("slope_per_day", "slope_per_day_sd", "last_z", "distances"))),
+    Change(
+        "pooled",
+        3,
+        dict.fromkeys(("curve_per_degc2", "curve_per_degc2_sd", "curve_with_value", "curve_with_slope")),
+    ),
 )
 """In the order in which they came."""
 

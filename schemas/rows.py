@@ -249,6 +249,10 @@ class PooledRow(UnitLead):
     status: str
     reason_code: str | None
     reason: str | None
+    curve_per_degc2: float | None
+    curve_per_degc2_sd: float | None
+    curve_with_value: float | None
+    curve_with_slope: float | None
 
 
 class DecisionRow(TypedDict):

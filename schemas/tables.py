@@ -321,7 +321,7 @@ _HISTORY = (
     Table(
         "pooled",
         "history",
-        2,
+        3,
         "one row a unit, sensor, parameter and axis: what all flights together say of it, led by the last one",
         (
             *c.LEAD,
@@ -359,6 +359,10 @@ _HISTORY = (
             c.STATUS,
             c.REASON_CODE,
             c.REASON,
+            c.CURVE_PER_DEGC2,
+            c.CURVE_PER_DEGC2_SD,
+            c.CURVE_WITH_VALUE,
+            c.CURVE_WITH_SLOPE,
         ),
         ("unit_id", "sensor", "parameter", "axis"),
     ),

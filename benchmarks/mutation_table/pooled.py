@@ -75,6 +75,18 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ("estimation.pooled.strengths", "_starts", "times = TIMES if with_slope else TIMES[:1]", "1 → 2"): START,
     (
         "estimation.pooled.strengths",
+        "is_bent",
+        "return bool(log_beyond_either_way(told[2] / np.sqrt(max(left, 1e-300) / freedom), freedom) < np.log(BENT))",
+        "< → <=",
+    ): NEVER_MET,
+    (
+        "estimation.pooled.strengths",
+        "is_bent",
+        "return bool(log_beyond_either_way(told[2] / np.sqrt(max(left, 1e-300) / freedom), freedom) < np.log(BENT))",
+        "1e-300 → 1.1000000000000002e-300",
+    ): GUARD,
+    (
+        "estimation.pooled.strengths",
         "unlikely",
         "return float(above if above > 0.0 else FEW * (above + EXPECTED_SHARE**2 / ratio - 1.0))",
         "> → >=",
@@ -87,20 +99,20 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     ): "counts are whole",
     (
         "estimation.pooled.unit",
-        "Pooled.rates",
+        "Pooled._each_alone",
         "size = np.sqrt(np.maximum(np.diagonal(n)[:d], 1e-300))",
         "1e-300 → 1.1000000000000002e-300",
     ): GUARD,
     (
         "estimation.pooled.unit",
-        "Pooled.rates",
+        "Pooled._each_alone",
         "inverse = np.linalg.pinv(n[:d, :d] / np.outer(size, size), rcond=1e-10, hermitian=True)",
         "1e-10 → 1.1000000000000001e-10",
     ): RCOND,
     (
         "estimation.pooled.unit",
-        "Pooled.rates",
-        "if information[i] > 1e-9 * alone[i]:",
+        "Pooled._each_alone",
+        "for i in np.flatnonzero(information > 1e-9 * alone)",
         "1e-09 → 1.1000000000000001e-09",
     ): RCOND,
     (
@@ -140,6 +152,18 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "estimation.pooled.unit",
         "surest_drift",
         "return surest if surest is not None and surest[0] < np.log(FALSE_ALARMS / len(found.names)) else None",
+        "< → <=",
+    ): NEVER_MET,
+    (
+        "estimation.pooled.unit",
+        "surest_bend",
+        "if abs(bend.per_degc2) * half**2 > np.sqrt(found.scatter[place])",
+        "> → >=",
+    ): NEVER_MET,
+    (
+        "estimation.pooled.unit",
+        "surest_bend",
+        "return surest if surest is not None and surest[0] < np.log(FALSE_ALARMS / zeros) else None",
         "< → <=",
     ): NEVER_MET,
     (

@@ -20,6 +20,8 @@ SHOWN = (
     "sd",
     "slope_per_degc",
     "slope_per_degc_sd",
+    "curve_per_degc2",
+    "curve_per_degc2_sd",
     "unit",
     "session_sd",
     "n_flights",

@@ -67,7 +67,7 @@ def predicted(row: DriftRow, degc: Array | float, days: Array | float) -> tuple[
     The value at 25 °C and the slope on temperature are correlated; they are independent at `best_known_degc`, B:
     var(T) = sd² + s²[(T − B)² − (25 °C − B)²], s the slope's sd. So are the value and the slope in time at
     `best_known_at`. Where one is not known the variances are added. Away from 25 °C and from the moment `as_of` at
-    once, the covariance of the two slopes is missing: ask along one of them.
+    once, the covariance of the two slopes is missing: ask along one of them. A bend's sd is left out.
     """
     degc, later = np.asarray(degc, dtype=float), np.asarray(days, dtype=float)
     level, slope_sd = row["value_at_25degc"], row["slope_per_degc_sd"] or 0.0

@@ -152,7 +152,7 @@ FORMS = {
     "run": (3, "ac506f44"),
     "information": (1, "0f251e66"),
     "drift": (4, "e8fac4a1"),
-    "pooled": (2, "cbd133c0"),
+    "pooled": (3, "12bb7db1"),
     "decision": (1, "ba9619df"),
     "export": (1, "a1abda15"),
 }

@@ -1,5 +1,6 @@
 -- What to fly with at a temperature: SELECT * FROM calibration_at(12.5). sd is that of the value; the next power-up
--- scatters about it by session_sd. A bend over temperature (curve_per_degc2, _degc3) is in the value, its sd is not.
+-- scatters about it by session_sd. A bend over temperature (curve_per_degc2, _degc3) is in the value; its sd is in that
+-- of the value where the source is pooled, of a trend's it is not.
 CREATE MACRO calibration_at(temperature_degc) AS TABLE
 SELECT
     l.vehicle_id, l.imu_id, l.unit_id, l.is_primary, l.sensor, l.method, l.parameter, l.axis,
@@ -13,6 +14,12 @@ SELECT
                 * (
                     (temperature_degc - coalesce(l.best_known_degc, {reference_degc})) ^ 2
                     - ({reference_degc} - coalesce(l.best_known_degc, {reference_degc})) ^ 2
+                )
+                + coalesce(
+                    2 * (temperature_degc - {reference_degc}) ^ 2 * l.curve_with_value
+                    + 2 * (temperature_degc - {reference_degc}) ^ 3 * l.curve_with_slope
+                    + (temperature_degc - {reference_degc}) ^ 4 * l.curve_per_degc2_sd ^ 2,
+                    0
                 ),
                 0
             )

@@ -6,7 +6,9 @@
 -- is brought to the reference temperature R, else taken as it is, whatever its temperature. sd goes with
 -- best_known_degc: var(T) = sd^2 + slope_per_degc_sd^2 ((T - best)^2 - (R - best)^2). Of several methods in a flight
 -- the most exact counts. source = 'pooled': what all flights know together (table pooled), those whose rows are refused
--- too, where it is known better so, or not at all otherwise.
+-- too, where it is known better so, or not at all otherwise; where one of trend and pooled has a bend over temperature
+-- and the other a straight line, the bend. A pooled bend is in the variance too: w = T - R, 2 w^2 curve_with_value +
+-- 2 w^3 curve_with_slope + w^4 curve_per_degc2_sd^2 more; of a trend's bend that is not known.
 CREATE VIEW latest_calibration AS
 WITH latest AS (
     SELECT
@@ -117,7 +119,7 @@ alone AS (
     FROM chosen
 ),
 together AS (
-    SELECT a, p
+    SELECT a, p, coalesce(a.temperature_degc - {reference_degc}, 0) AS w
     FROM alone AS a
     FULL JOIN (
         SELECT * FROM pooled WHERE status IN ('ok', 'step', 'drifting') AND parameter IN ('scale', 'zero', 'lever_arm', 'delay')
@@ -135,10 +137,13 @@ better AS (
                 p.sd ^ 2 + coalesce(p.slope_per_degc_sd, 0) ^ 2 * (
                     (coalesce(a.temperature_degc, {reference_degc}) - p.best_known_degc) ^ 2
                     - ({reference_degc} - p.best_known_degc) ^ 2
+                ) + coalesce(
+                    2 * w ^ 2 * p.curve_with_value + 2 * w ^ 3 * p.curve_with_slope + w ^ 4 * p.curve_per_degc2_sd ^ 2, 0
                 ) < a.sd ^ 2 + p.session_sd ^ 2 + p.walk_per_sqrt_day ^ 2
                     * coalesce(greatest(epoch(p.started_at) - epoch(a.started_at), 0) / 86400, 0),
                 false
             )
+            WHEN (a.curve_per_degc2 IS NULL) <> (p.curve_per_degc2 IS NULL) THEN p.curve_per_degc2 IS NOT NULL
             ELSE coalesce(p.sd <= a.sd, false)
         END AS by_all
     FROM together
@@ -156,7 +161,7 @@ SELECT
     CASE WHEN by_all THEN p.sd ELSE a.sd END AS sd,
     CASE WHEN by_all THEN p.slope_per_degc ELSE a.slope_per_degc END AS slope_per_degc,
     CASE WHEN by_all THEN p.slope_per_degc_sd ELSE a.slope_per_degc_sd END AS slope_per_degc_sd,
-    CASE WHEN NOT by_all THEN a.curve_per_degc2 END AS curve_per_degc2,
+    CASE WHEN by_all THEN p.curve_per_degc2 ELSE a.curve_per_degc2 END AS curve_per_degc2,
     CASE WHEN NOT by_all THEN a.curve_per_degc3 END AS curve_per_degc3,
     CASE WHEN by_all THEN p.unit ELSE a.unit END AS unit,
     CASE WHEN by_all THEN {reference_degc} ELSE a.temperature_degc END AS temperature_degc,
@@ -169,6 +174,9 @@ SELECT
     CASE WHEN by_all THEN p.temperature_min_degc ELSE a.temperature_min_degc END AS temperature_min_degc,
     CASE WHEN by_all THEN p.temperature_max_degc ELSE a.temperature_max_degc END AS temperature_max_degc,
     a.drift_status,
-    CASE WHEN by_all THEN p.reason ELSE a.why END AS why
+    CASE WHEN by_all THEN p.reason ELSE a.why END AS why,
+    CASE WHEN by_all THEN p.curve_per_degc2_sd END AS curve_per_degc2_sd,
+    CASE WHEN by_all THEN p.curve_with_value END AS curve_with_value,
+    CASE WHEN by_all THEN p.curve_with_slope END AS curve_with_slope
 FROM better
 ORDER BY unit_id, sensor, parameter, axis;

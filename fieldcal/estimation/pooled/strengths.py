@@ -15,6 +15,7 @@ from scipy.optimize import brentq, minimize
 
 from fieldcal.compiled import LIBRARY
 from fieldcal.compiled import series as compiled
+from fieldcal.estimation.pooled.chance import log_beyond_either_way
 from fieldcal.geometry.rotation import Array
 
 RESTART_SD = 4.5
@@ -30,6 +31,8 @@ TOLERANCES = {"fatol": 0.01, "xatol": 0.02}
 """Of minus twice the logarithm of the likelihood and of logarithms of variances: well below `RISE` and `GRID`."""
 GRID = 1.25
 """Ratio of neighbouring variances that are told apart."""
+BENT = 0.01
+"""Chance that a straight series is taken for a bent one: then its scatter counts a little too small."""
 START, TIMES = (0.2, 0.4, 0.5), (1.0, 4.0, 16.0, 64.0, 256.0)
 """Sd of walk, scatter and slope over that of a session itself, and times them, from where the likeliest are looked
 for."""
@@ -185,6 +188,18 @@ def of_pairs(within: Array, slope: float, own: float) -> float:
     variance of that) at a variance of slopes, over that of a session itself; one beyond RESTART_SD counts no more."""
     variance = slope * within[:, 0] ** 2 + within[:, 2]
     return float(np.sum(np.minimum(np.log(variance / own) + within[:, 1] ** 2 / variance, RESTART_SD**2)))
+
+
+def is_bent(series: Array, scatter: float) -> bool:
+    """Whether a series (m, 4), m > 3, of day, temperature, value and variance bends with temperature by its scatter:
+    Student's t of the coefficient of the square. `scatter` beside the variances weighs the sessions alone."""
+    _, warmth, value, variance = series.T
+    freedom = len(value) - 3
+    root = (variance + scatter) ** -0.5
+    axes = np.linalg.qr(np.vander(warmth, 3, increasing=True) * root[:, None])[0]
+    told = axes.T @ (value * root)
+    left = float(np.sum((value * root - axes @ told) ** 2))
+    return bool(log_beyond_either_way(told[2] / np.sqrt(max(left, 1e-300) / freedom), freedom) < np.log(BENT))
 
 
 def _on_grid(value: float) -> float:

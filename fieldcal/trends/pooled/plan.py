@@ -157,7 +157,7 @@ def _manoeuvre(
     flown = _in_sensor_axes(flown, axes, polarity)
     flown = flown.of([name for name in flown.names if name in found.names])
     warm = one.unit.flights[-1].warmth_degc
-    own = state_of(Flight(flown, 0, warm), found.names, found.sloped, 0.0, found.drifting)
+    own = state_of(Flight(flown, 0, warm), found.names, found.sloped, 0.0, found.drifting, bent=found.bent)
     now = found.chain.at(float(one.unit.day[-1]))
     after = now + Known(own.information, np.zeros(len(own.right))).loosened(found.scatter)
     before, later = now.estimate(), after.estimate()

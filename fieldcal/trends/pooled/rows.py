@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime, timedelta
+from operator import itemgetter
 
 import numpy as np
 import polars as pl
@@ -25,11 +26,14 @@ INFORMED_SHARE = 0.5
 TELLS = 1e-3
 """Share of what is known of a constant from which on a flight is one of those that tell it: others do so by what they
 know of other constants."""
+SOUGHT = 9
+"""Temperatures among those flown at which it is asked how well a bent zero is known."""
 FIELD_T = 5e-5
 """The earth's field, about."""
 TURN = "Turn it 60° either way about the sensor's {axis} axis, several times."
 TILT = "Turn it over, so that the sensor's {axis} axis points up, down and level."
 Row = dict[str, object]
+NO_CURVE: Row = dict.fromkeys(("curve_per_degc2", "curve_per_degc2_sd", "curve_with_value", "curve_with_slope"))
 
 
 def rows_of_unit(one: HistoryUnit, found: Pooled, distance: Array, kinds: Kinds, day: float | None = None) -> list[Row]:
@@ -51,7 +55,7 @@ def rows_of_unit(one: HistoryUnit, found: Pooled, distance: Array, kinds: Kinds,
         strength = kinds[name[:2]]
         size = abs(factor[place])
         refusal = _refusal(found, now, place, name, degc[place], one)
-        status, code, reason = Status.OK.value, None, _sentence(found, place, shares[:, place], left_out)
+        status, code, reason = Status.OK.value, None, _sentence(found, now, place, shares[:, place], left_out)
         if reason and (far := int(np.sum(distance > 1.0))):
             reason += (
                 f" {far} left out: made at scales up to {distance.max():.1f} times as far from these as they hold. "
@@ -73,6 +77,9 @@ def rows_of_unit(one: HistoryUnit, found: Pooled, distance: Array, kinds: Kinds,
         rate = rates[place] if one.last["started_at"] is not None else None
         slope = found.sloped.index(place) + len(found.names) if place in found.sloped else None
         known = bool(np.isfinite(now.covariance[place, place]))
+        bend, curve = found.bend_at(place), NO_CURVE
+        if slope is not None and bend is not None and known:
+            curve = _curve(now, factor[place], place, slope, bend)
         sloped = slope is not None and bool(np.isfinite(now.covariance[slope, slope]))
         own = {
             **{column.name: one.last[column.name] for column in LEAD},
@@ -111,9 +118,21 @@ def rows_of_unit(one: HistoryUnit, found: Pooled, distance: Array, kinds: Kinds,
             "status": status,
             "reason_code": code,
             "reason": reason,
+            **curve,
         }
         rows.append(own)
     return rows
+
+
+def _curve(now: Estimate, factor: float, place: int, slope: int, bend: int) -> Row:
+    """A constant's bend as the history has it, by where the state has its value, slope and bend."""
+    with_value, with_slope, own = factor**2 * now.covariance[bend, [place, slope, bend]]
+    return {
+        "curve_per_degc2": float(factor * now.state[bend]),
+        "curve_per_degc2_sd": float(np.sqrt(own)),
+        "curve_with_value": float(with_value),
+        "curve_with_slope": float(with_slope),
+    }
 
 
 def strengths_told(table: pl.DataFrame, one: HistoryUnit) -> Kinds:
@@ -162,7 +181,7 @@ def _in_history(one: HistoryUnit, found: Pooled, now: Estimate) -> tuple[Array, 
 
 
 def _best_degc(found: Pooled, now: Estimate, flown: tuple[float, float] | None) -> list[float]:
-    """Temperature at which each constant is known best."""
+    """Temperature at which each constant's value and slope are independent: a straight one is known best there."""
     out = []
     for place in range(len(found.names)):
         degc = REFERENCE_DEGC
@@ -182,8 +201,10 @@ def _refusal(found: Pooled, now: Estimate, place: int, name: Name, best: float, 
     limit, scale, unit = limit_of(one, name)
     if limit is None:
         return None if np.isfinite(now.covariance[place, place]) else f"No flight shows {words_of(name)}."
-    at = best if one.temperatures_degc is None else float(np.clip(best, *one.temperatures_degc))
-    value, variance = now.of(found.combination(place, at - REFERENCE_DEGC))
+    flown = [best] if one.temperatures_degc is None else [float(np.clip(best, *one.temperatures_degc))]
+    if one.temperatures_degc is not None and place in found.bent:
+        flown = [*flown, *np.linspace(*one.temperatures_degc, SOUGHT)]
+    value, variance = min((now.of(found.combination(place, at - REFERENCE_DEGC)) for at in flown), key=itemgetter(1))
     sd = np.sqrt(variance) / (abs(value) if name[1] == "gain" else 1.0)
     if sd <= limit:
         return None
@@ -219,7 +240,7 @@ def words_of(name: Name) -> str:
     return f"the {name[0]}'s {name[2]} {parameter}".replace("  ", " ")
 
 
-def _sentence(found: Pooled, place: int, shares: Array, left_out: list[str]) -> str:
+def _sentence(found: Pooled, now: Estimate, place: int, shares: Array, left_out: list[str]) -> str:
     """What the value is from."""
     flights = int(np.sum(shares > TELLS))
     sessions = len({flight.session for k, flight in enumerate(found.unit.flights) if shares[k] > TELLS})
@@ -231,6 +252,9 @@ def _sentence(found: Pooled, place: int, shares: Array, left_out: list[str]) -> 
             text += f" It stepped by {abs(step.z):.0f} sd; earlier flights tell no more of it."
     if place in found.drifting and (rate := found.rates()[place]) is not None:
         text += f" It drifts steadily, {abs(rate.z):.0f} sd from not at all."
+    if (bend := found.bend_at(place)) is not None:
+        value, variance = now.state[bend], now.covariance[bend, bend]
+        text += f" It bends with temperature, {abs(value) / np.sqrt(variance):.0f} sd from not at all."
     return text
 
 

@@ -3,8 +3,8 @@
 A row of the joint estimate whose constant the table `pooled` knows has the smoother's value, slopes, step, drift and
 count of flights instead of those of a regression of the flights' own rows; `bias` and `zero_bias`, which follow from
 scale and zero, follow here too. The regression stands where flights kept no information, where the smoother refuses the
-constant, and with its numbers where it has a bend with temperature; without a step or drift where the smoother waits
-for another session.
+constant, and with its numbers where it alone has a bend with temperature; without a step or drift where the smoother
+waits for another session.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ AXIS = ("unit_id", "sensor", "axis")
 COLUMNS = tuple(name for name in Trends.__dataclass_fields__ if name != "kept")
 OF_CHANGE = ("n_flights", "n_sessions", "last_z", "change_day", "change_size", "change_size_sd", "drift_p")
 """Columns that are the smoother's wherever it judges."""
+CURVE = ("curve_per_degc2", "curve_per_degc2_sd", "curve_per_degc3", "curve_per_degc3_sd")
 BY_FLIGHT = ("flights", "shares", "distances")
 """Columns of `pooled` that have an entry a flight: nothing here asks them."""
 Columns = dict[str, float]
@@ -90,11 +91,11 @@ def read(
     columns = {name: getattr(trends, name).copy() for name in COLUMNS}
     covered, beside = np.zeros(rows.height, dtype=bool), [""] * rows.height
     verdict, borrowed = np.full(rows.height, "", dtype=object), borrowed.copy()
-    as_of, bent = rows["as_of"].to_list(), rows["curve_per_degc2"].is_not_null().to_list()
+    as_of, curves = rows["as_of"].to_list(), rows.select(CURVE).to_numpy().copy()
     for k, row in enumerate(rows.iter_rows(named=True)):
         if row["method"] not in JOINT_METHODS or (told := _told(row, known, readings)) is None:
             continue
-        judge, numbers, complete = told
+        judge, numbers, curve, complete = told
         if judge["status"] == DriftStatus.INSUFFICIENT:
             verdict[k], beside[k] = judge["status"], str(judge["reason"])
         elif judge["left_out"]:
@@ -105,11 +106,17 @@ def read(
         verdict[k] = judge["status"] if judge["status"] in MOVING else DriftStatus.STABLE.value
         if judge["status"] == DriftStatus.STEP and judge["change_size"] is None:
             verdict[k] = DriftStatus.STABLE.value  # the sensor was exchanged, which is told of all its rows
+        complete = complete and bool(np.isfinite(curve[0]) or np.isnan(curves[k, 0]))
         for name, value in numbers.items():
-            if name in OF_CHANGE or (complete and not bent[k]):
+            if name in OF_CHANGE or complete:
                 columns[name][k] = value
+        if complete:
+            curves[k] = curve
         borrowed[k], as_of[k] = np.nan, judge["started_at"]
-    rows = rows.with_columns(as_of=pl.Series(as_of, dtype=rows.schema["as_of"]))
+    rows = rows.with_columns(
+        as_of=pl.Series(as_of, dtype=rows.schema["as_of"]),
+        **{name: pl.Series(curves[:, i], nan_to_null=True) for i, name in enumerate(CURVE)},
+    )
     return Read(rows, replace(trends, **columns), borrowed, covered, verdict, beside)
 
 
@@ -149,21 +156,29 @@ def readings(flights: pl.DataFrame) -> dict[tuple[str, ...], float]:
 
 def _told(
     row: Mapping[str, object], known: Pools, readings: Mapping[tuple[str, ...], float]
-) -> tuple[PooledRow, Columns, bool] | None:
-    """(row of `pooled` that judges a row of `drift`, columns of `Trends` by it, whether its numbers are complete); None
-    where there is none. What follows from scale and zero steps and drifts as the zero does."""
+) -> tuple[PooledRow, Columns, Array, bool] | None:
+    """(row of `pooled` that judges a row of `drift`, columns of `Trends` by it, `CURVE` (4,), whether its numbers
+    are complete); None where there is none. What follows from scale and zero steps and drifts as the zero does."""
     axis, parameter = tuple(str(row[name]) for name in AXIS), str(row["parameter"])
     own = known.get(axis, {})
     judge = own.get("zero" if parameter in OF_BOTH else parameter)
     if judge is None:
         return None
     if parameter not in OF_BOTH:
-        return (judge, _columns(judge), True) if judge["unit"] == row["unit"] else None
+        return (judge, _columns(judge), _curve(judge, 1.0), True) if judge["unit"] == row["unit"] else None
     reading = readings.get((*axis, str(row["method"]), parameter))
     if reading is None or (scale := own.get("scale")) is None:
         return None
     complete = scale["status"] in KNOWN and judge["status"] in KNOWN
-    return judge, _at_reading(scale, judge, reading) if complete else _columns(judge), complete
+    if not complete:
+        return judge, _columns(judge), _curve(judge, np.nan), False
+    return judge, _at_reading(scale, judge, reading), _curve(judge, -_number(scale["value_at_25degc"])), True
+
+
+def _curve(row: PooledRow, factor: float) -> Array:
+    """`CURVE` (4,) of what is so many times a zero, NaN where there is none."""
+    square, sd = _number(row["curve_per_degc2"]), _number(row["curve_per_degc2_sd"])
+    return np.array([factor * square, abs(factor) * sd, np.nan, np.nan])
 
 
 def _columns(row: PooledRow) -> Columns:
