@@ -31,7 +31,9 @@ import polars as pl
 from threadpoolctl import threadpool_limits
 
 from fieldcal.estimation.normal_equations import Name, NormalEquations
-from fieldcal.estimation.pooled.unit import Flight, Unit, pool, strengths
+from fieldcal.estimation.pooled.changes import pool
+from fieldcal.estimation.pooled.movement import strengths
+from fieldcal.estimation.pooled.unit import Flight, Unit
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import SENSORS, Sensor
 from fieldcal.simulation.archive import settings, signals

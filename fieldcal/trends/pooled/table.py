@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from fieldcal.estimation.pooled.unit import Kinds, Pooled, Unit, pool, strengths
+from fieldcal.estimation.pooled.changes import pool
+from fieldcal.estimation.pooled.movement import strengths
+from fieldcal.estimation.pooled.unit import Kinds, Pooled, Unit
 from fieldcal.flight.threads import one_thread
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Status

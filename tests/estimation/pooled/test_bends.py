@@ -11,8 +11,10 @@ from scipy.stats import norm
 from scipy.stats import t as t_distribution
 
 from fieldcal.estimation.normal_equations import NormalEquations
+from fieldcal.estimation.pooled.changes import pool, surest_bend
+from fieldcal.estimation.pooled.movement import strengths, within_sessions
 from fieldcal.estimation.pooled.strengths import BENT, Strengths, is_bent
-from fieldcal.estimation.pooled.unit import Flight, Kinds, Unit, pool, smoothed, strengths, surest_bend, within_sessions
+from fieldcal.estimation.pooled.unit import Flight, Kinds, Unit, smoothed
 from fieldcal.geometry.rotation import Array
 
 RTOL = 1e-6

@@ -8,25 +8,10 @@ from scipy.stats import norm
 
 from fieldcal.estimation.normal_equations import NormalEquations
 from fieldcal.estimation.pooled.chain import Estimate, Known
+from fieldcal.estimation.pooled.changes import contradiction, jumps, pool, surest_drift, surest_step
+from fieldcal.estimation.pooled.movement import first_strengths, said_beside, series_of_sessions, within_sessions
 from fieldcal.estimation.pooled.strengths import Strengths
-from fieldcal.estimation.pooled.unit import (
-    Flight,
-    LeftOut,
-    Pooled,
-    Step,
-    Unit,
-    contradiction,
-    first_strengths,
-    jumps,
-    pool,
-    said_beside,
-    series_of_sessions,
-    smoothed,
-    state_of,
-    surest_drift,
-    surest_step,
-    within_sessions,
-)
+from fieldcal.estimation.pooled.unit import Flight, LeftOut, Pooled, Step, Unit, smoothed, state_of
 from fieldcal.geometry.rotation import Array
 
 RTOL = 1e-6

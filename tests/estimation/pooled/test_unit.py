@@ -10,17 +10,10 @@ from pooled import NAMES, PER_DEGC, SCATTER, Truth, alarms, drawn, of_names
 
 from fieldcal.estimation.normal_equations import NormalEquations
 from fieldcal.estimation.pooled.chain import Known
+from fieldcal.estimation.pooled.changes import contradiction, pool
+from fieldcal.estimation.pooled.movement import said_beside, strengths
 from fieldcal.estimation.pooled.strengths import Series, Strengths, innovations, strengths_of
-from fieldcal.estimation.pooled.unit import (
-    LEAST_SHARE,
-    Flight,
-    Kinds,
-    Unit,
-    contradiction,
-    pool,
-    said_beside,
-    strengths,
-)
+from fieldcal.estimation.pooled.unit import LEAST_SHARE, Flight, Kinds, Unit
 
 SESSIONS = 12
 KNOWN: Kinds = {
