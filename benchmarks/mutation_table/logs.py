@@ -552,4 +552,10 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "found = buffer.find(field, found + 1, limit)",
         "1 → 2",
     ): "the field does not begin anew a byte on",
+    (
+        "logs.rosbag1.file",
+        "BagContainer._read_index",
+        'pairs = np.frombuffer(self._buffer[record.data : record.end], "<u4").reshape(-1, 2)',
+        "1 → 2",
+    ): ANY_NEGATIVE,
 }
