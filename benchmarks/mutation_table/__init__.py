@@ -8,6 +8,14 @@ from mutation_table import by_pose, by_velocity, clock_sync, estimation, exports
 
 TESTS: dict[str, Sequence[str]] = {
     "exports": ("exports/test_*.py",),
+    "exports.autopilots": (
+        "exports/test_a[fu]*.py",
+        "exports/test_comparison*.py",
+        "exports/test_loading*.py",
+        "exports/test_texts*.py",
+    ),
+    "exports.calibration_at": ("exports/test_calibration_at*.py",),
+    "exports.refit": ("exports/test_refit*.py",),
     "geometry": ("geometry/test_*.py",),
     "geometry.earth_field": ("geometry/test_earth_field*.py",),
     "geometry.rotation": ("geometry/test_rotation*.py",),

@@ -552,4 +552,17 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "found = buffer.find(field, found + 1, limit)",
         "1 → 2",
     ): "the field does not begin anew a byte on",
+    (
+        "logs.rosbag1.file",
+        "BagContainer._read_index",
+        'pairs = np.frombuffer(self._buffer[record.data : record.end], "<u4").reshape(-1, 2)',
+        "1 → 2",
+    ): ANY_NEGATIVE,
+    (
+        "logs.rosbag2.folder",
+        "FolderContainer.blocks",
+        "new_ids = np.full(len(block.channels), -1, np.int64)",
+        "1 → 2",
+    ): ANY_NEGATIVE,
+    ("logs.csv.reader", "CsvLog.__init__", "self._needed = 1", "1 → 2"): "a file alone is the first of one",
 }

@@ -222,7 +222,7 @@ def test_utf_16_without_a_mark_is_told_by_its_zeros(tmp_path: Path, order: str) 
     assert read("a,b\n1,2\n\u0174\u0175\n") != "a,b\n1,2\n\u0174\u0175\n".encode()  # 9 of 11 pairs: too few
     assert read("a,b\n1,2\n3,\u0174\n") == "a,b\n1,2\n3,\u0174\n".encode()  # 11 of 12
     assert read("abcdef\n") != b"abcdef\n"  # 7 pairs say too little
-    tied = "abcdefgh\u0100\n"  # 9 of 10 pairs is not more than nine tenths
+    tied = "abcdefgh\u0101\n"  # 9 of 10 pairs is not more than nine tenths
     assert read(tied) != tied.encode()
     (tmp_path / "log.csv").write_bytes(b"\0" * 40)
     assert LineBlocks(tmp_path / "log.csv")._encoding == "utf-8"

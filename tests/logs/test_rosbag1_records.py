@@ -3,39 +3,15 @@
 from __future__ import annotations
 
 import bz2
-import struct
 from fractions import Fraction
 
 import numpy as np
 import pytest
+from rosbag1_records import chunk, field, length, message, record
 
 from fieldcal.logs.rosbag1 import chunks
 from fieldcal.logs.rosbag1.chunks import ChunkOpener, is_chunk, is_record, next_chunk
 from fieldcal.logs.rosbag1.records import Damage, messages_of, read_fields, read_record, walk
-
-
-def length(size: int) -> bytes:
-    return struct.pack("<I", size)
-
-
-def field(name: str, value: bytes) -> bytes:
-    content = name.encode() + b"=" + value
-    return length(len(content)) + content
-
-
-def record(header: bytes, data: bytes, declared: int | None = None) -> bytes:
-    return length(len(header)) + header + length(len(data) if declared is None else declared) + data
-
-
-def message(connection: int, seconds: int, nanoseconds: int, payload: bytes) -> bytes:
-    time = struct.pack("<II", seconds, nanoseconds)
-    return record(field("op", b"\2") + field("conn", length(connection)) + field("time", time), payload)
-
-
-def chunk(content: bytes, size: int, compression: bytes = b"none", declared: int | None = None) -> bytes:
-    header = field("op", b"\5") + field("compression", compression) + field("size", length(size))
-    return record(header, content, declared)
-
 
 OTHER = record(field("op", b"\7") + field("conn", length(1)), b"xyz")
 

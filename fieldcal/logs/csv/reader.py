@@ -53,7 +53,7 @@ class CsvLog:
             except UnreadableLog as error:
                 if number < self._needed:
                     raise
-                self._without(part.vps is not None and part.imu is None, error)
+                self._without(part.imu is None, error)
         found = self._join.joined(self._name) if self._join is not None else None
         if found is not None:
             batch, finding = found

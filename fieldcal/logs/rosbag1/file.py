@@ -53,10 +53,10 @@ class BagContainer:
         self.metadata: dict[str, dict[str, str]] = {}
         self._tally = Tally()
         self._said: Counter[int] | None = None
-        self._check_magic()
-        closed, index = self._bag_header()
-        self._closed = closed
-        if not (closed and self._read_index(index)):
+        self._begin = self._first_record()
+        index = self._index_place()
+        self._closed = bool(index)
+        if not (self._closed and self._read_index(index)):
             for _ in self.blocks(frozenset()):
                 pass
             self._tally = Tally()
@@ -75,7 +75,7 @@ class BagContainer:
     def blocks(self, channels: Collection[int]) -> Iterator[Block]:
         """See `Container`. Chunks are read whole: of every channel."""
         opener = ChunkOpener(self._buffer)
-        position: int | None = len(MAGIC)
+        position: int | None = self._begin
         while position is not None and position < self._limit:
             try:
                 record = read_record(self._buffer, position, self._limit, whole=False)
@@ -103,7 +103,8 @@ class BagContainer:
         """See `Container`. Nothing in a bag is under a checksum."""
         report(self._name, self._limit, self._closed, self._tally, self.definitions, self._said, summary)
 
-    def _check_magic(self) -> None:
+    def _first_record(self) -> int:
+        """Where records begin: behind the magic, else at the first chunk. Raises UnreadableLog where it is no bag."""
         begin = self._buffer[: len(MAGIC)]
         if begin.startswith(b"#ROSRECORD") or (begin.startswith(b"#ROSBAG V") and begin != MAGIC):
             version = begin.decode("ascii", "replace").strip()
@@ -111,24 +112,27 @@ class BagContainer:
                 ReasonCode.NOT_BAG,
                 f"{self._name} is a bag of another format ({version}); 2.0 is read. Convert it: rosbag fix.",
             )
-        if begin != MAGIC and next_chunk(self._buffer, 0, self._limit) is None:
+        if begin == MAGIC:
+            return len(MAGIC)
+        first = next_chunk(self._buffer, 0, self._limit)
+        if first is None:
             raise UnreadableLog(
                 ReasonCode.NOT_BAG,
                 f"{self._name} does not begin like a ROS bag and holds no whole chunk. Check what it is.",
             )
+        return first
 
-    def _bag_header(self) -> tuple[bool, int]:
-        """Whether the recorder closed the bag, and where the index begins. Raises UnreadableLog for encrypted bags."""
+    def _index_place(self) -> int:
+        """Where the index begins; 0 where the recorder did not close the bag. Raises UnreadableLog if encrypted."""
         try:
             record = read_record(self._buffer, len(MAGIC), self._limit)
             if record.opcode != BAG_HEADER:
-                return False, 0
-            if record.fields.get(b"encryptor", (0, b""))[1]:
+                return 0
+            if b"encryptor" in record.fields and record.value(b"encryptor"):
                 raise UnreadableLog(ReasonCode.NOT_BAG, f"{self._name} is encrypted. Decrypt it: rosbag decrypt.")
-            index = record.number(b"index_pos")
+            return record.number(b"index_pos")
         except Damage:
-            return False, 0
-        return index > 0, index
+            return 0
 
     def _read_index(self, position: int) -> bool:
         """Take connections and counts from the index at the file's end; whether it is whole."""
@@ -139,8 +143,8 @@ class BagContainer:
                 if record.opcode == CONNECTION:
                     _add_connection(definitions, self._buffer, record)
                 elif record.opcode == CHUNK_INFO:
-                    pairs = np.frombuffer(self._buffer[record.data : record.end], "<u4")
-                    for connection, count in pairs[: len(pairs) // 2 * 2].reshape(-1, 2).tolist():
+                    pairs = np.frombuffer(self._buffer[record.data : record.end], "<u4").reshape(-1, 2)
+                    for connection, count in pairs.tolist():
                         said[connection] += count
                 else:
                     return False
@@ -172,7 +176,7 @@ class BagContainer:
     def _loose_end(self, position: int) -> int:
         """The end of a run of messages outside chunks."""
         begin = position
-        while position < self._limit and position - begin < _LOOSE_BYTES:
+        while position - begin < _LOOSE_BYTES:
             try:
                 record = read_record(self._buffer, position, self._limit)
             except Damage:
@@ -186,7 +190,7 @@ class BagContainer:
         """Where reading goes on behind damage: the end that the record declares, else the next chunk."""
         try:
             end = read_record(self._buffer, position, self._limit).end
-            if end > position and is_record(self._buffer, end, self._limit):
+            if is_record(self._buffer, end, self._limit):
                 return end
         except Damage:
             pass

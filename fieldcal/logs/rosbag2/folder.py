@@ -154,4 +154,5 @@ class FolderContainer:
 
 
 def _open(path: Path) -> Container:
-    return McapContainer(path) if ".mcap" in path.name.lower()[-10:] else SqliteContainer(path)
+    end = path.name.removeprefix(stem(path.name)).lower()
+    return McapContainer(path) if ".mcap" in end else SqliteContainer(path)

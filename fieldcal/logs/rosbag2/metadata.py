@@ -17,6 +17,7 @@ CAP_BYTES = 2 << 20
 
 _NAME = re.compile(r"^[ \-]*name:[ ]+(\S.*?)[ ]*$", re.MULTILINE)
 _COUNT = re.compile(r"^[ \-]*message_count:[ ]+(\d{1,18})[ ]*$", re.MULTILINE)
+_QUOTED = re.compile(r"(['\"])(.*)\1")
 
 
 @dataclass
@@ -52,8 +53,10 @@ def read_metadata(folder: Path) -> BagMetadata:
 def _items(lines: list[str], key: str) -> list[str]:
     """The items of the block list under a key: the lines of each, without its dash."""
     found: list[list[str]] = []
-    start = next((number for number, line in enumerate(lines) if line.strip() == f"{key}:"), len(lines))
-    outer, inner = _indent(lines[start]) if start < len(lines) else 0, -1
+    start = next((number for number, line in enumerate(lines) if line.strip() == f"{key}:"), None)
+    if start is None:
+        return []
+    outer, inner = _indent(lines[start]), -1
     for line in lines[start + 1 :]:
         if not line.strip():
             continue
@@ -74,5 +77,5 @@ def _indent(line: str) -> int:
 
 def _plain(text: str) -> str:
     """A scalar without its quotes."""
-    stripped = text.strip()
-    return stripped[1:-1] if len(stripped) > 1 and stripped[0] == stripped[-1] and stripped[0] in "'\"" else stripped
+    quoted = _QUOTED.fullmatch(text.strip())
+    return quoted[2] if quoted else text.strip()
