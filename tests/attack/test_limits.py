@@ -15,8 +15,7 @@ from typing import Any
 import pytest
 from outside_ci import outside_ci
 
-from fieldcal.batch import watchdog
-from fieldcal.batch.limits import why_ended
+from fieldcal.batch.limits import watchdog, why_ended
 from fieldcal.batch.steps import FlightWork
 from fieldcal.config.configuration import Configuration, Document, Limits, LimitsTable, Vehicle, load
 from fieldcal.config.reader_settings import reader_settings

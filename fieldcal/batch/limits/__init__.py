@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from fieldcal.batch import watchdog
+from fieldcal.batch.limits import watchdog
 from fieldcal.config.configuration import Limits, Vehicle
 from fieldcal.flight.job import Job
 from fieldcal.provenance.run_key import code_digest
