@@ -145,7 +145,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     (
         "estimation.pooled.changes",
         "surest_drift",
-        "if abs(rate.per_day) * length > np.sqrt(found.scatter[place])",
+        "if abs(rate.value) * length > np.sqrt(found.scatter[place])",
         "> → >=",
     ): NEVER_MET,
     (
@@ -157,7 +157,7 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
     (
         "estimation.pooled.changes",
         "surest_bend",
-        "if abs(bend.per_degc2) * half**2 > np.sqrt(found.scatter[place])",
+        "if abs(bend.value) * half**2 > np.sqrt(found.scatter[place])",
         "> → >=",
     ): NEVER_MET,
     (

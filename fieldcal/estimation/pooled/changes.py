@@ -18,7 +18,7 @@ from fieldcal.estimation.pooled.unit import (
 from fieldcal.geometry.rotation import Array
 
 FALSE_ALARMS = 0.003
-"""Chance that a unit without any has a step, and that it has a flight left out."""
+"""Chance that a unit without any has a step; the same of a steady drift, of a bend, and of a flight left out."""
 FEWEST_TO_CONTRADICT, FEWEST_BESIDE_A_STEP, FEWEST_TO_DRIFT, FEWEST_TO_BEND = 3, 2, 5, 5
 """Sessions that it takes to say of one flight that it contradicts; of either side of a step; of a constant that it
 drifts; at different temperatures, that it bends with temperature."""
@@ -125,7 +125,7 @@ def surest_drift(found: Pooled, freedom: Array) -> tuple[float, int] | None:
         (float(log_beyond_either_way(rate.z, freedom[place])), place)
         for place, rate in enumerate(found.rates())
         if rate is not None and place not in found.drifting
-        if abs(rate.per_day) * length > np.sqrt(found.scatter[place])
+        if abs(rate.value) * length > np.sqrt(found.scatter[place])
     ]
     surest = min(chances, default=None)
     return surest if surest is not None and surest[0] < np.log(FALSE_ALARMS / len(found.names)) else None
@@ -147,7 +147,7 @@ def surest_bend(found: Pooled, freedom: Array) -> tuple[float, int] | None:
     chances = [
         (float(log_beyond_either_way(bend.z, freedom[place])), place)
         for place, bend in bends.items()
-        if abs(bend.per_degc2) * half**2 > np.sqrt(found.scatter[place])
+        if abs(bend.value) * half**2 > np.sqrt(found.scatter[place])
     ]
     surest, zeros = min(chances, default=None), len(bends) + len(found.bent)
     return surest if surest is not None and surest[0] < np.log(FALSE_ALARMS / zeros) else None

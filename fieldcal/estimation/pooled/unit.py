@@ -59,27 +59,15 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Rate:
-    """What all sessions say of a steady change of one constant, beside its walk: `per_day` with sd `sd`."""
+class Coefficient:
+    """What all sessions say of how a constant changes beside the state: `value` with sd `sd`."""
 
-    per_day: float
+    value: float
     sd: float
 
     @property
     def z(self) -> float:
-        return self.per_day / self.sd
-
-
-@dataclass(frozen=True)
-class Bend:
-    """What all sessions say of a zero's coefficient of the square of temperature: `per_degc2` with sd `sd`."""
-
-    per_degc2: float
-    sd: float
-
-    @property
-    def z(self) -> float:
-        return self.per_degc2 / self.sd
+        return self.value / self.sd
 
 
 @dataclass(frozen=True)
@@ -135,25 +123,26 @@ class Pooled:
             out[place] = np.nan_to_num(state[self.bend_at(place)])
         return out
 
-    def rates(self) -> list[Rate | None]:
-        """What is known of each constant's steady change: of those that drift by the state, of another as if it alone
-        did; None where nothing is."""
+    def rates(self) -> list[Coefficient | None]:
+        """What is known of each constant's steady change a day, beside its walk: of those that drift by the state, of
+        another as if it alone did; None where nothing is."""
         p, last, now = len(self.names), float(self.unit.day[-1]), self.at()
-        out: list[Rate | None] = [None] * p
+        out: list[Coefficient | None] = [None] * p
         for place, at in zip(self.drifting, self._rates, strict=True):
             if np.isfinite(now.covariance[at, at]) and now.covariance[at, at] > 0.0:
-                out[place] = Rate(float(now.state[at]), float(np.sqrt(now.covariance[at, at])))
+                out[place] = Coefficient(float(now.state[at]), float(np.sqrt(now.covariance[at, at])))
         others = [place for place in range(p) if place not in self.drifting]
         by_day = np.eye(len(self.scatter))[:, others]
         sessions = [
             _with_more(own, by_day * (day - last)) for day, own in zip(self.chain.day, self.chain.own, strict=True)
         ]
         for i, told in self._each_alone(sessions).items():
-            out[others[i]] = Rate(*told)
+            out[others[i]] = told
         return out
 
-    def bends(self) -> dict[int, Bend]:
-        """What is known, by place, of the bend of each zero that is straight in the state, as if it alone were bent."""
+    def bends(self) -> dict[int, Coefficient]:
+        """What is known, by place, of the coefficient of the square of temperature of each zero that is straight in the
+        state, as if it alone were bent."""
         others = [place for place in self.sloped if self.names[place][1] == BENDING and place not in self.bent]
         level = np.eye(len(self.scatter))[:, others]
         slope = np.eye(len(self.scatter))[:, [len(self.names) + self.sloped.index(place) for place in others]]
@@ -167,11 +156,11 @@ class Pooled:
                 own = _with_more(self.raw[k], 2.0 * w * slope - w**2 * level)
                 sessions[flight.session] = sessions[flight.session] + own
         told = self._each_alone([known.loosened(scatter) for known in sessions])
-        return {others[i]: Bend(*one) for i, one in told.items()}
+        return {others[i]: one for i, one in told.items()}
 
-    def _each_alone(self, sessions: Sequence[Known]) -> dict[int, tuple[float, float]]:
+    def _each_alone(self, sessions: Sequence[Known]) -> dict[int, Coefficient]:
         """Of coefficients that stand behind the state in what sessions say: each by its number as if it alone were
-        there, (value, sd), where anything is known."""
+        there, where anything is known."""
         d = len(self.scatter)
         known, none = Known.nothing(len(sessions[0].right)), np.zeros(len(sessions[0].right) - d)
         known.information[:d, :d], known.right[:d] = self.chain.before[0].information, self.chain.before[0].right
@@ -188,7 +177,7 @@ class Pooled:
         information = alone - np.einsum("ij,jk,ik->i", beside, inverse, beside)
         right = g[d:] - beside @ inverse @ (g[:d] / size)
         return {
-            int(i): (float(right[i] / information[i]), float(1.0 / np.sqrt(information[i])))
+            int(i): Coefficient(float(right[i] / information[i]), float(1.0 / np.sqrt(information[i])))
             for i in np.flatnonzero(information > 1e-9 * alone)
         }
 

@@ -90,7 +90,7 @@ def test_the_bend_of_a_straight_zero_is_that_of_least_squares_in_which_it_is_ben
     assert found.bend_of() == pytest.approx([0.0])
     state, covariance = dense(read, slopes, bent=True)
     (bend,) = found.bends().values()
-    assert bend.per_degc2 == pytest.approx(state[11], rel=RTOL)
+    assert bend.value == pytest.approx(state[11], rel=RTOL)
     assert bend.sd == pytest.approx(np.sqrt(covariance[11, 11]), rel=RTOL)
     assert bend.z == pytest.approx(state[11] / np.sqrt(covariance[11, 11]), rel=RTOL)
 
@@ -114,7 +114,7 @@ def test_zeros_of_two_axes_are_each_least_squares_by_itself() -> None:
         assert both.bend_of()[place] == pytest.approx(state[11], rel=RTOL)
         bends = smoothed(unit, KINDS, (), (), (), (1 - place,)).bends()
         assert list(bends) == [place]
-        assert bends[place].per_degc2 == pytest.approx(state[11], rel=RTOL)
+        assert bends[place].value == pytest.approx(state[11], rel=RTOL)
         assert bends[place].sd == pytest.approx(np.sqrt(covariance[11, 11]), rel=RTOL)
 
 

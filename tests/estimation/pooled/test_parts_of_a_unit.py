@@ -161,7 +161,7 @@ def test_the_rate_of_each_constant_is_that_of_least_squares_in_which_it_alone_dr
     for place, rate in enumerate(rates):
         state, covariance = with_rates(alone, [place])
         assert rate is not None
-        assert rate.per_day == pytest.approx(state[-1], rel=RTOL)
+        assert rate.value == pytest.approx(state[-1], rel=RTOL)
         assert rate.sd == pytest.approx(np.sqrt(covariance[-1, -1]), rel=RTOL)
         assert rate.z == pytest.approx(state[-1] / np.sqrt(covariance[-1, -1]), rel=RTOL)
 
@@ -172,7 +172,7 @@ def test_rates_beside_a_step_are_least_squares_too() -> None:
     for place, rate in enumerate(smoothed(unit, LEVERS, (step,), (), ()).rates()):
         state, covariance = with_rates(alone, [place], (2, 0))
         assert rate is not None
-        assert rate.per_day == pytest.approx(state[-1], rel=RTOL)
+        assert rate.value == pytest.approx(state[-1], rel=RTOL)
         assert rate.sd == pytest.approx(np.sqrt(covariance[-1, -1]), rel=RTOL)
 
 
@@ -262,7 +262,7 @@ def test_a_rate_that_was_named_is_of_the_state_and_takes_it_to_any_day() -> None
         assert own.covariance[0, 0] == pytest.approx(1.5 * design @ covariance @ design, rel=1e-5)
     (rate,) = found.rates()
     assert rate is not None
-    assert (rate.per_day, rate.sd) == (
+    assert (rate.value, rate.sd) == (
         pytest.approx(slope, rel=RTOL),
         pytest.approx(np.sqrt(1.5 * covariance[0, 0]), rel=1e-5),
     )

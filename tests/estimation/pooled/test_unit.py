@@ -79,7 +79,7 @@ def test_a_steady_drift_is_named_with_its_rate_and_is_no_step() -> None:
         (i,) = found.drifting
         told = found.rates()[i]
         assert told is not None
-        z.append((told.per_day - rate) / told.sd)
+        z.append((told.value - rate) / told.sd)
         for session in (0, SESSIONS // 2, SESSIONS - 1):
             then = found.at(float(unit.day[session]))
             true = truth.walked[session, place] + rate * unit.day[session]
@@ -109,7 +109,7 @@ def test_one_rate_among_others_is_least_squares() -> None:
     (rate,) = found.rates()
     (slope, _), covariance = np.polyfit(day, value, 1, cov="unscaled")
     assert rate is not None
-    assert rate.per_day == pytest.approx(slope)
+    assert rate.value == pytest.approx(slope)
     assert rate.sd == pytest.approx(np.sqrt(1.5 * covariance[0, 0]))
     z = found.last_z()[0]
     off = value[-1] - value[:-1].mean()
