@@ -4,6 +4,7 @@
     python benchmarks/mutation.py --sample 200 --seed 3           # 200 changes, drawn over all modules
     python benchmarks/mutation.py --module logs.mcap.chunks       # one module, all changes
     python benchmarks/mutation.py --module exports --sample 40    # a room
+    python benchmarks/mutation.py --sample 200 --part 1/2         # every second module of the sample; the others: 2/2
 
 Needs the `test` extra and a system with fork. Nothing is written to the checkout: the changed module lives in the
 memory of a forked process. First a module's own tests (`TESTS` in `mutation_table`) run unchanged, and it is noted
@@ -462,6 +463,7 @@ def main() -> None:
     parser.add_argument("--line", type=int, help="only changes of this line of the module")
     parser.add_argument("--sample", type=int, help="as many changes, drawn evenly from all; all without it")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--part", default="1/1", help="k/n: the k-th of n parts, one for each processor")
     parser.add_argument("--patience", type=float, default=20.0, help="tests that take longer are left out, s (20)")
     arguments = parser.parse_args()
 
@@ -477,6 +479,9 @@ def main() -> None:
         )
     if not drawn:
         raise SystemExit(f"Nothing to change in {arguments.module}; the modules are those of TESTS.")
+    part, parts = map(int, arguments.part.split("/"))
+    own = set(sorted({change.module for change in drawn})[part - 1 :: parts])
+    drawn = [change for change in drawn if change.module in own]
     scores: dict[str, Score] = {}
     for module, changes in itertools.groupby(drawn, key=lambda c: c.module):
         known: list[Change] = []

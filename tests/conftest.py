@@ -20,11 +20,13 @@ sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 @pytest.fixture(scope="session")
 def prefect_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of a server that is running, which fieldcal takes from the environment; started at the first use."""
+    from kept_processes import kept
+
     from fieldcal.flows.server import Server, prepare_environment
 
     former = os.environ.pop("PREFECT_API_URL", None)
     prepare_environment(tmp_path_factory.mktemp("prefect"))
-    with Server(Path(os.environ["PREFECT_HOME"])) as server:
+    with kept(), Server(Path(os.environ["PREFECT_HOME"])) as server:
         url = server.wait()
         yield url
     if former is not None:
