@@ -338,6 +338,12 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "1e-300 → 1.1000000000000002e-300",
     ): GUARD,
     (
+        "estimation.joint.ladder",
+        "magnetometer_start",
+        "solution = np.linalg.lstsq(columns, reading.reshape(-1), rcond=1e-8)[0]",
+        "1 → 2",
+    ): ANY_NEGATIVE,
+    (
         "estimation.joint.measurement_model",
         "",
         "CHUNK_ROWS = 512  # at a time: a few megabytes with all intermediate arrays, what a core holds in its cache",

@@ -138,7 +138,7 @@ def _start_attitude(
     for name, start in vectors.items():
         logged = r.accelerometer if name == "accelerometer" else r.magnetometer
         if start is not None and logged is not None:
-            sensed[name] = _filled(r.t, logged) * start[0] + start[1]
+            sensed[name] = filled(r.t, logged) * start[0] + start[1]
     if len(sensed) == 2 and gyro is None:
         both = {name: low_passed(r.t, r.segment, x, START_CUTOFF_HZ, 0.5) for name, x in sensed.items()}
         gyro = _gyro_start(r, continuous(_turned_to(r, both)))
@@ -193,7 +193,7 @@ def _wander(t: Array, offset: Array, side_s: float) -> float:
     return float(np.sqrt(np.mean(angle_between(offset[:-apart], offset[apart:]) ** 2)))
 
 
-def _filled(t: Array, x: Array) -> Array:
+def filled(t: Array, x: Array) -> Array:
     """Readings at every sample, interpolated linearly where there are none."""
     valid = np.isfinite(x).all(axis=1)
     return x if valid.all() else np.column_stack([np.interp(t, t[valid], c[valid]) for c in x.T])

@@ -11,6 +11,7 @@ import numpy as np
 
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation.joint import initialise
+from fieldcal.estimation.joint.field_start import gyroscope_by_field
 from fieldcal.estimation.joint.fit import JointFit, fit_joint
 from fieldcal.estimation.joint.problem import PriorConstants, Readings
 from fieldcal.geometry.rotation import Array, body_from_inertial
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 # Where gravity moved less than this in sensor axes, rms over the axes, in g, the accelerometer tells nothing of its
 # constants: they are held at those known beforehand, since translation would draw them along.
 LEAST_TILT = 0.15
+FROM_GIVEN = (Rung.FREE, Rung.FIELD_START, Rung.FIELD_ALONE)
+WITH_ARM = (Rung.FREE, Rung.FIELD_START, Rung.INERTIAL_START)
 HELD_SD = 1e-5  # of held constants, as a share of what is known of them
 
 
@@ -47,7 +50,8 @@ def fit_with_fallbacks(
 
     `free`: every constant, from the start given. `held`: the accelerometer's constants held at those known beforehand.
     `inertial_start`: attitudes from accelerometer and gyroscope alone, the magnetometer's start from those. `zeros`:
-    the gyroscope's scales held too.
+    the gyroscope's scales held too. Of a gyroscope in counts, of which nothing is known beforehand, `field_start`: all
+    from how fast the field turns; `field_alone`: from there without an accelerometer in counts too.
 
     Parameters
     ----------
@@ -55,7 +59,7 @@ def fit_with_fallbacks(
     start : mapping
         As of `initialise.prepare`.
     priors : mapping
-        Sensor → what is known of it beforehand; of counts nothing is, and only `free` can be tried.
+        Sensor → what is known of it beforehand; of counts nothing is.
     lever_arm : (3,) array, optional
         As measured on the vehicle, sensor axes.
     doubt_lever_arm : bool
@@ -76,16 +80,9 @@ def fit_with_fallbacks(
             level = tilt_rms(prepared[1].q) < LEAST_TILT
         except (UnusableFlight, EstimationError) as error:
             failed[Rung.FREE] = str(error)
-    rungs = [Rung.HELD] if level else [Rung.FREE, Rung.HELD]
-    if {"accelerometer", "gyroscope"} <= set(priors) and readings.magnetometer is not None:
-        rungs.append(Rung.INERTIAL_START)
-    if "gyroscope" in priors:
-        rungs.append(Rung.ZEROS)
-    for rung in rungs:
-        if rung != Rung.FREE and "accelerometer" not in priors:
-            continue
+    for rung in _rungs(readings, start, priors, level):
         own_start, own_priors = dict(start), dict(priors)
-        if rung != Rung.FREE:
+        if rung not in FROM_GIVEN:
             own_start |= {name: known[name] for name in ("accelerometer", "gyroscope") if name in known}
         if rung in (Rung.HELD, Rung.ZEROS) or level:
             own_priors["accelerometer"] = held(priors["accelerometer"])
@@ -94,10 +91,14 @@ def fit_with_fallbacks(
         try:
             if rung == Rung.INERTIAL_START:
                 own_start["magnetometer"] = magnetometer_start(readings, own_start)
+            if rung in (Rung.FIELD_START, Rung.FIELD_ALONE):
+                own_start["gyroscope"] = gyroscope_by_field(readings, own_start["magnetometer"])
+            if rung == Rung.FIELD_ALONE:
+                own_start["accelerometer"] = None
             if rung != Rung.FREE or prepared is None:
                 prepared = initialise.prepare(readings, own_start, lever_arm=lever_arm)
             model, state = prepared
-            free_arm = lever_arm is None and not level and rung in (Rung.FREE, Rung.INERTIAL_START)
+            free_arm = lever_arm is None and not level and rung in WITH_ARM
             fit = fit_joint(model, state, try_lever_arm=free_arm, priors=own_priors, doubt_lever_arm=doubt_lever_arm)
         except (UnusableFlight, EstimationError) as error:
             failed[rung] = str(error)
@@ -106,6 +107,23 @@ def fit_with_fallbacks(
         return Outcome(fit, rung, failed)
     assert first is not None
     raise first
+
+
+def _rungs(
+    readings: Readings, start: Mapping[str, Constants | None], priors: Mapping[str, PriorConstants], level: bool
+) -> list[Rung]:
+    """What is tried, in this order."""
+    by_field = "gyroscope" not in priors and start.get("magnetometer") is not None
+    rungs = [] if level else [Rung.FREE]
+    if by_field and not level:
+        rungs.append(Rung.FIELD_START)
+    if "accelerometer" in priors:
+        rungs.append(Rung.HELD)
+        if "gyroscope" in priors:
+            rungs += [Rung.ZEROS] if readings.magnetometer is None else [Rung.INERTIAL_START, Rung.ZEROS]
+    elif by_field:
+        rungs.append(Rung.FIELD_ALONE)
+    return rungs
 
 
 def held(prior: PriorConstants) -> PriorConstants:

@@ -238,8 +238,8 @@ def test_readings_are_filled_along_time() -> None:
     holed = x.copy()
     holed[[3, 4, 20]] = np.nan
     holed[30, 1] = np.nan
-    np.testing.assert_allclose(initialise._filled(t, holed), x, rtol=1e-12)
-    assert initialise._filled(t, x) is x
+    np.testing.assert_allclose(initialise.filled(t, holed), x, rtol=1e-12)
+    assert initialise.filled(t, x) is x
 
 
 def flown(*, seconds: float = 20.0, sign: float = 1.0, parts: int = 1) -> tuple[Readings, Array]:

@@ -39,6 +39,7 @@ class Climbed:
         monkeypatch.setattr(ladder.initialise, "prepare", self.prepare)
         monkeypatch.setattr(ladder, "fit_joint", self.fit)
         monkeypatch.setattr(ladder, "magnetometer_start", lambda readings, start: ("own start", tuple(start)))
+        monkeypatch.setattr(ladder, "gyroscope_by_field", lambda readings, magnetometer: f"by {magnetometer}")
 
     def prepare(self, readings: Readings, start: Mapping[str, Any], *, lever_arm: Array | None = None) -> Any:
         self.prepared.append({"start": dict(start), "lever_arm": lever_arm})
@@ -126,13 +127,43 @@ def test_a_level_record_holds_the_accelerometer_from_the_first(
     assert any(asked["arm"] for asked in climbed.asked) != level
 
 
-def test_what_is_not_known_beforehand_has_one_rung(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_counts_start_from_the_field_where_attitudes_give_no_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    for failing, unprepared in (((1,), ()), ((), (1,))):
+        climbed = Climbed(monkeypatch)
+        climbed.failing, climbed.unprepared = failing, unprepared
+        outcome = climbed.run(())
+        assert outcome.rung == Rung.FIELD_START
+        assert list(outcome.failed) == [Rung.FREE]
+        own = {**START, "gyroscope": f"by {START['magnetometer']}"}
+        assert climbed.prepared[-1] == {"start": own, "lever_arm": None}
+        assert (climbed.asked[-1]["arm"], climbed.asked[-1]["priors"]) == (True, {})
+
+
+def test_counts_whose_accelerometer_spoils_the_start_do_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    climbed = Climbed(monkeypatch)
+    climbed.failing = (1, 2)
+    outcome = climbed.run(())
+    assert outcome.rung == Rung.FIELD_ALONE
+    assert list(outcome.failed) == [Rung.FREE, Rung.FIELD_START]
+    own = {**START, "gyroscope": f"by {START['magnetometer']}", "accelerometer": None}
+    assert climbed.prepared[-1]["start"] == own
+    assert not climbed.asked[-1]["arm"]
+
+
+def test_what_is_not_known_beforehand_has_three_rungs(monkeypatch: pytest.MonkeyPatch) -> None:
+    climbed = Climbed(monkeypatch)
+    climbed.failing = (1, 2, 3)
+    with pytest.raises(EstimationError, match="fit 1"):
+        climbed.run(())
+    assert len(climbed.asked) == 3
+    monkeypatch.setitem(START, "magnetometer", None)  # type: ignore[arg-type]
     climbed = Climbed(monkeypatch)
     climbed.failing = (1,)
     with pytest.raises(EstimationError, match="fit 1"):
         climbed.run(())
     assert len(climbed.asked) == 1
-    for known, rungs in ((("gyroscope",), 1), (("accelerometer",), 2), (("gyroscope", "magnetometer"), 1)):
+    monkeypatch.undo()
+    for known, rungs in ((("gyroscope",), 1), (("accelerometer",), 3), (("gyroscope", "magnetometer"), 1)):
         climbed = Climbed(monkeypatch)
         climbed.failing = tuple(range(1, 9))
         with pytest.raises(EstimationError, match="fit 1"):
