@@ -28,6 +28,7 @@ TESTS: dict[str, Sequence[str]] = {
     "logs.discovery": ("logs/test_logs_discovery*.py",),
     "logs.encodings": ("logs/test_encodings*.py", "logs/test_logs_mcap.py", "logs/test_logs_protobuf.py"),
     "logs.encodings.transforms": ("logs/test_encodings*.py", "logs/test_transforms.py", "logs/test_rosbag1.py"),
+    "logs.further_units": ("logs/test_further_units.py", "logs/test_dataflash_*.py"),
     "logs.ingest": ("logs/test_logs_[deim]*.py", "logs/test_mcap_in_the_wild.py"),
     "logs.joining": ("logs/test_logs_autopilot.py", "logs/test_dataflash_*.py", "logs/test_ulog_*.py"),
     "logs.mcap": ("logs/test_mcap_*.py", "logs/test_logs_mcap*.py", "logs/test_logs_protobuf.py"),

@@ -133,6 +133,29 @@ def test_the_first_of_each_stamp_is_kept(held: int | None) -> None:
     assert signal.conflicts == 4000
 
 
+ROUNDED = {  # how many readings each stamp has
+    "of 120 rows 12 contradict, a tenth": ([2] * 12 + [1] * 96, False),
+    "of 120 rows 13 contradict": ([2] * 13 + [1] * 94, True),
+    "19 of 20 stamps have as many": ([5] + [1] * 19, False),
+    "18 of 20 stamps have as many": ([5, 4] + [1] * 18, True),
+}
+
+
+@pytest.mark.parametrize("case", ROUNDED)
+@pytest.mark.parametrize("copied", [False, True])
+def test_many_contradictions_in_stamps_of_unlike_numbers_are_rounded_stamps(case: str, copied: bool) -> None:
+    """The middle reading of each stamp counts; otherwise the first, and where a row is there twice in any case."""
+    sizes, expected = ROUNDED[case]
+    t_ns = np.repeat(steady(len(sizes)), sizes)
+    columns = imu(t_ns)
+    if copied:
+        columns = rows(columns, np.r_[0, 0, 2 : len(t_ns)])
+    frame, signal = tidied(columns)
+    firsts = columns["gyroscope_x"][np.unique(t_ns, return_index=True)[1]].tolist()
+    assert signal.rounded == (expected and not copied)
+    assert (frame["gyroscope_x"].to_list() == firsts) != signal.rounded
+
+
 def test_of_rounded_stamps_the_kept_reading_is_as_old_as_its_stamp() -> None:
     """185 Hz, stamps of two decimals: the kept readings' true times are on average those of their stamps."""
     true = np.rint(np.arange(7400) / 185.0 * S).astype(np.int64)

@@ -70,6 +70,20 @@ def test_rotations_of_recent_firmware_are_those_of_mavlinks_names() -> None:
     assert checked == 41
 
 
+OLDER_NAMES = [
+    "ROLL_270_YAW_270", "ROLL_180_PITCH_270", "PITCH_90_YAW_180", "PITCH_90_ROLL_90", "YAW_293_PITCH_68_ROLL_90",
+    "PITCH_90_ROLL_270", "PITCH_9_YAW_180", "PITCH_45", "PITCH_315", "ROLL_90_YAW_270",
+]  # fmt: skip
+"""Of the numbers from 26 on, in rotation.h of v1.11."""
+
+
+def test_rotations_of_older_firmware_are_those_of_its_names() -> None:
+    for number, name in enumerate(OLDER_NAMES, start=26):
+        angles = {axis: float(degrees) for axis, degrees in re.findall(r"(ROLL|PITCH|YAW)_(\d+)", name)}
+        expected = turned(*(angles.get(axis, 0.0) for axis in ("ROLL", "PITCH", "YAW")))
+        np.testing.assert_allclose(rotation(number, 0x010B0000), expected, atol=1e-12, err_msg=name)
+
+
 def test_a_rotation_that_there_is_not_is_none_and_old_firmware_had_other_numbers() -> None:
     for number in (-1, 41, 1_104_674_816):
         np.testing.assert_array_equal(rotation(number), np.eye(3))

@@ -18,9 +18,9 @@ LEAP_SECONDS = (
     (datetime(2012, 7, 1, tzinfo=UTC), 16),
     (datetime(2009, 1, 1, tzinfo=UTC), 15),
     (datetime(2006, 1, 1, tzinfo=UTC), 14),
-    (datetime(1999, 1, 1, tzinfo=UTC), 13),
 )
 """How far GPS time is ahead of UTC from when on, the latest first. None has been announced since 2017."""
+BEFORE_THOSE_S = 13
 NO_LATER_US = 4 * 10**15
 """A boot clock beyond 126 years is damage: it is cut to this, which is far from all others and fits int64 ns."""
 LATEST_SAMPLE_NS = 1_000_000_000
@@ -80,5 +80,5 @@ def epoch(gps: Rows | None) -> Epoch | None:
 
 
 def leap_seconds(unix_ns: int) -> int:
-    """Seconds that GPS time is ahead of UTC at a time; of the table's earliest entry before that."""
-    return next((s for since, s in LEAP_SECONDS if unix_ns >= since.timestamp() * 1e9), LEAP_SECONDS[-1][1])
+    """Seconds that GPS time is ahead of UTC at a time; those of 1999 to 2005 at any earlier one too."""
+    return next((s for since, s in LEAP_SECONDS if unix_ns >= since.timestamp() * 1e9), BEFORE_THOSE_S)
