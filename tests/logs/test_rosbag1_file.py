@@ -172,6 +172,25 @@ def test_reading_goes_on_at_the_next_chunk(tmp_path: Path, junk: bytes) -> None:
     assert read.told["damaged_chunk"].endswith("Messages lost: none.")
 
 
+def test_a_chunk_that_lacks_bytes_costs_itself_alone(tmp_path: Path) -> None:
+    """In whichever place they are missing: no byte of another message is taken for one of theirs, and the chunk behind,
+    inside which the declared end lies, is read whole. (Nothing tells where messages as long as what is missing are
+    spliced: a bag has no checksums.)"""
+    letters = b"cdefgh"
+    messages = [message(1, 3 + i, 0, bytes([letter]) * 9) for i, letter in enumerate(letters)]
+    middle, last = stored(b"".join(messages)), stored(message(1, 9, 0, b"yz"))
+    begin = len(middle) - sum(map(len, messages))
+    for cut in (1, 2, 7, 40, len(messages[0]), len(messages[0]) + 5):
+        for at in range(begin, len(middle) - cut + 1, cut if cut == len(messages[0]) else 1):
+            read = Read(tmp_path, BEGIN + FIRST + middle[:at] + middle[at + cut :] + last)
+            assert (read.blocks[0], read.blocks[-1]) == (b"ab", b"yz"), (at, cut)
+            inside = b"".join(read.blocks[1:-1])
+            kept = [letter for letter in letters if bytes([letter]) * 9 in inside]
+            assert inside == b"".join(bytes([letter]) * 9 for letter in kept), (at, cut)
+            assert len(kept) >= (at - begin) // len(messages[0]) - 1, (at, cut)
+            assert f"the chunk lacks {cut} of its bytes" in read.told["damaged_chunk"]
+
+
 def test_reading_goes_on_where_a_damaged_record_ends_if_a_record_begins_there(tmp_path: Path) -> None:
     """A chunk of no known compression, then messages outside chunks: no next chunk is needed to find them."""
     odd = chunk(b"abc", 3, b"zip")

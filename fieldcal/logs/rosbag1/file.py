@@ -83,6 +83,13 @@ class BagContainer:
                     raise Damage(f"the record at byte {position} ends behind the file")
                 if record.opcode == CHUNK:
                     content = opener.open(record, self._limit)
+                    if (following := self._inside(record)) is not None:
+                        why = f"the chunk lacks {record.end - following} of its bytes"
+                        self._tally.damaged.append((position, why))
+                        left = np.frombuffer(content, np.uint8)[: following - record.data]
+                        yield from self._stretch(left, position, lacking=True)
+                        position = following
+                        continue
                     yield from self._stretch(np.frombuffer(content, np.uint8), record.start)
                 elif record.opcode == MESSAGE:
                     end = self._loose_end(position)
@@ -155,9 +162,12 @@ class BagContainer:
             self.definitions, self._said = definitions, said
         return bool(definitions.channels)
 
-    def _stretch(self, data: NDArray[np.uint8], place: int) -> Iterator[Block]:
-        """The messages of a chunk's content, or of bytes of the file."""
+    def _stretch(self, data: NDArray[np.uint8], place: int, *, lacking: bool = False) -> Iterator[Block]:
+        """The messages of a chunk's content, or of bytes of the file. Where bytes are missing (`lacking`), the record
+        before the one that is none has taken bytes of what follows for its own: it is left out too."""
         starts, headers, damage = walk(data.data, 0, data.size)
+        if lacking and damage:
+            starts, headers = starts[:-1], headers[:-1]
         messages, others, malformed = messages_of(data, starts, headers)
         if damage or malformed:
             self._tally.damaged.append((place, damage or f"{malformed} records of the chunk are none"))
@@ -195,6 +205,13 @@ class BagContainer:
         except Damage:
             pass
         return next_chunk(self._buffer, position + 1, self._limit)
+
+    def _inside(self, chunk: Record) -> int | None:
+        """Where the next chunk begins, if that is before the end that this one declares: bytes of it are missing."""
+        if chunk.end > self._limit or is_record(self._buffer, chunk.end, self._limit):
+            return None
+        found = next_chunk(self._buffer, chunk.data, self._limit)
+        return found if found is not None and found < chunk.end else None
 
     def _define(self, buffer: Buffer, record: Record) -> None:
         try:
