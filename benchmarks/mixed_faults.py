@@ -97,9 +97,13 @@ def one(number: int, kind: str, method: str) -> tuple[str, bool, int, pl.DataFra
     current = None if rng.integers(2) else logged.current_a  # known or not
     with one_thread():
         results = run_flight(signals(replace(logged, current_a=current)), settings(flight.experiment, method=method))
-    rows = results["choice"].tables["calibration"].filter(pl.col("axis").str.len_chars() == 1)
+    rows = results["choice"].tables["calibration"]
+    crossed = set(rows.filter(pl.col("axis").str.len_chars() == 2, status=str(Status.OK))["sensor"])
+    rows = rows.filter(pl.col("axis").str.len_chars() == 1)
     rows = rows.filter(pl.col("parameter").is_in(["scale", "bias", "zero"]))
-    truth = {key: value for sensor in SENSORS for key, value in _truth(flight, logged, faults, sensor)}
+    truth = {
+        key: value for sensor in SENSORS for key, value in _truth(flight, logged, faults, sensor, sensor in crossed)
+    }
     keys = zip(rows["sensor"], rows["parameter"], rows["axis"], strict=True)
     rows = rows.with_columns(true=pl.Series([truth[key] for key in keys], dtype=pl.Float64)).with_columns(
         off=(pl.col("value") - pl.col("true")) / pl.col("sd"), flight=pl.lit(number), kind=pl.lit(kind)
@@ -108,10 +112,11 @@ def one(number: int, kind: str, method: str) -> tuple[str, bool, int, pl.DataFra
 
 
 def _truth(
-    flight: SimulatedFlight, logged: SimulatedFlight, faults: Faults, sensor: Sensor
+    flight: SimulatedFlight, logged: SimulatedFlight, faults: Faults, sensor: Sensor, crossed: bool
 ) -> Iterator[tuple[tuple[str, str, str], float]]:
     """(sensor, parameter, axis) and the constant that makes true values of logged ones: with motors at their mean
-    current, with a sensitivity to force at its mean, and of a sensor that is no line those of the nearest line."""
+    current, with a sensitivity to force at its mean, and of a sensor that is no line those of the nearest line. The
+    bias is that of the published form: of the whole matrix (`crossed`), else zero = -bias/scale axis by axis."""
     scale = faults.true_scale(flight, sensor)
     own = np.array(flight.experiment.scale[sensor])
     zero = -np.array(flight.experiment.bias[sensor]) / own
@@ -126,7 +131,7 @@ def _truth(
         scale, zero = np.diag([slope for slope, _ in lines]), np.array([-offset / slope for slope, offset in lines])
     for i, axis in enumerate("xyz"):
         yield (sensor, "scale", axis), float(scale[i, i])
-        yield (sensor, "bias", axis), float(-scale[i] @ zero)
+        yield (sensor, "bias", axis), float(-scale[i] @ zero if crossed else -scale[i, i] * zero[i])
         yield (sensor, "zero", axis), float(zero[i])
 
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from fieldcal.errors import EstimationError, UnusableFlight
 from fieldcal.estimation.joint import initialise
-from fieldcal.estimation.joint.field_start import gyroscope_by_field
 from fieldcal.estimation.joint.fit import JointFit, fit_joint
 from fieldcal.estimation.joint.problem import PriorConstants, Readings
+from fieldcal.estimation.joint.turning_start import gyroscope_by_turning
 from fieldcal.geometry.rotation import Array, body_from_inertial
 from fieldcal.names import Rung
 from fieldcal.reason_codes import ReasonCode
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 # Where gravity moved less than this in sensor axes, rms over the axes, in g, the accelerometer tells nothing of its
 # constants: they are held at those known beforehand, since translation would draw them along.
 LEAST_TILT = 0.15
-FROM_GIVEN = (Rung.FREE, Rung.FIELD_START, Rung.FIELD_ALONE)
-WITH_ARM = (Rung.FREE, Rung.FIELD_START, Rung.INERTIAL_START)
+FROM_GIVEN = (Rung.FREE, Rung.TURNING_START, Rung.FIELD_ALONE)
+WITH_ARM = (Rung.FREE, Rung.TURNING_START, Rung.INERTIAL_START)
 HELD_SD = 1e-5  # of held constants, as a share of what is known of them
 
 
@@ -50,8 +50,9 @@ def fit_with_fallbacks(
 
     `free`: every constant, from the start given. `held`: the accelerometer's constants held at those known beforehand.
     `inertial_start`: attitudes from accelerometer and gyroscope alone, the magnetometer's start from those. `zeros`:
-    the gyroscope's scales held too. Of a gyroscope in counts, of which nothing is known beforehand, `field_start`: all
-    from how fast the field turns; `field_alone`: from there without an accelerometer in counts too.
+    the gyroscope's scales held too. Of a gyroscope in counts, of which nothing is known beforehand, `turning_start`:
+    all from how fast the field turns, without a magnetometer gravity; `field_alone`: from there without an
+    accelerometer in counts too.
 
     Parameters
     ----------
@@ -91,8 +92,8 @@ def fit_with_fallbacks(
         try:
             if rung == Rung.INERTIAL_START:
                 own_start["magnetometer"] = magnetometer_start(readings, own_start)
-            if rung in (Rung.FIELD_START, Rung.FIELD_ALONE):
-                own_start["gyroscope"] = gyroscope_by_field(readings, own_start["magnetometer"])
+            if rung in (Rung.TURNING_START, Rung.FIELD_ALONE):
+                own_start["gyroscope"] = gyroscope_by_turning(readings, own_start)
             if rung == Rung.FIELD_ALONE:
                 own_start["accelerometer"] = None
             if rung != Rung.FREE or prepared is None:
@@ -113,15 +114,15 @@ def _rungs(
     readings: Readings, start: Mapping[str, Constants | None], priors: Mapping[str, PriorConstants], level: bool
 ) -> list[Rung]:
     """What is tried, in this order."""
-    by_field = "gyroscope" not in priors and start.get("magnetometer") is not None
+    in_counts = "gyroscope" not in priors
     rungs = [] if level else [Rung.FREE]
-    if by_field and not level:
-        rungs.append(Rung.FIELD_START)
+    if in_counts and not level:
+        rungs.append(Rung.TURNING_START)
     if "accelerometer" in priors:
         rungs.append(Rung.HELD)
         if "gyroscope" in priors:
             rungs += [Rung.ZEROS] if readings.magnetometer is None else [Rung.INERTIAL_START, Rung.ZEROS]
-    elif by_field:
+    elif in_counts and start.get("magnetometer") is not None:
         rungs.append(Rung.FIELD_ALONE)
     return rungs
 

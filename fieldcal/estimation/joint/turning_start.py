@@ -1,10 +1,12 @@
-"""A start of the gyroscope that needs no accelerometer: how fast the field turns in sensor axes.
+"""A start of the gyroscope that needs no attitude: how fast the field, or gravity, turns in sensor axes.
 
 Where vectors tell no attitude to begin with, translation being as large as gravity, the field's direction still turns
-with the body alone.
+with the body alone; and where there is no magnetometer, one vector tells it too.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -22,17 +24,17 @@ ROUNDS = 10
 LEAST_TURNING = 1e-6  # smallest over largest eigenvalue of the normal equations of columns of length 1
 
 
-def gyroscope_by_field(readings: Readings, magnetometer: Constants | None) -> Constants:
-    """Scale and bias of the gyroscope from the magnetometer alone.
+def gyroscope_by_turning(readings: Readings, start: Mapping[str, Constants | None]) -> Constants:
+    """Scale and bias of the gyroscope from the magnetometer alone; without one from the accelerometer.
 
-    A field that stands still turns in body axes by dm/dt = m × ω, with ω = λ g + b: linear in λ (3,) and b (3,). Both
-    sides are low-passed alike, so that no derivative is taken of noise.
+    A vector v that stands still turns in body axes by dv/dt = v × ω, with ω = λ g + b: linear in λ (3,) and b (3,).
+    Both sides are low-passed alike, so that no derivative is taken of noise.
 
     Parameters
     ----------
     readings : Readings
-    magnetometer : (scale (3,), bias (3,)), optional
-        In logged units.
+    start : sensor → (scale (3,), bias (3,)) or None
+        Of magnetometer and accelerometer, in logged units.
 
     Returns
     -------
@@ -42,24 +44,28 @@ def gyroscope_by_field(readings: Readings, magnetometer: Constants | None) -> Co
     Raises
     ------
     UnusableFlight
-        `no_start`: no magnetometer or none of its constants, or turning about one axis only.
+        `no_start`: neither vector with constants, or turning about one axis only.
     """
-    if readings.magnetometer is None or magnetometer is None:
-        raise UnusableFlight(ReasonCode.NO_START, "Without a magnetometer no field tells how fast it turned.")
     t, segment = readings.t, readings.segment
-    m = filled(t, readings.magnetometer) * magnetometer[0] + magnetometer[1]
-    m = m / np.linalg.norm(readings.field_ned)
-    across = np.cross(m[:, None, :], np.eye(3))  # (n, 3, 3): m × eᵢ
+    lengths_of = {"magnetometer": float(np.linalg.norm(readings.field_ned)), "accelerometer": readings.gravity_mps2}
+    for name, length in lengths_of.items():
+        logged, known = getattr(readings, name), start.get(name)
+        if logged is not None and known is not None:
+            v = (filled(t, logged) * known[0] + known[1]) / abs(length)
+            break
+    else:
+        raise UnusableFlight(ReasonCode.NO_START, "Neither a field nor gravity tells how fast it turned.")
+    across = np.cross(v[:, None, :], np.eye(3))  # (n, 3, 3): v × eᵢ
     rows = np.concatenate([across * readings.gyroscope[:, :, None], across], axis=1)
     x = low_passed(t, segment, rows.reshape(len(t), -1), START_CUTOFF_HZ, SIDE_S).reshape(len(t), 6, 3)
-    low = low_passed(t, segment, m, START_CUTOFF_HZ, SIDE_S)
+    low = low_passed(t, segment, v, START_CUTOFF_HZ, SIDE_S)
     change = np.concatenate([differentiate_samples(t[a:b], low[a:b]) for a, b in run_bounds(segment)])
     columns = x.transpose(0, 2, 1)
     lengths = np.sqrt(np.sum(columns**2, axis=(0, 1)))
     unit = columns / np.maximum(lengths, 1e-300)
     spread = np.linalg.eigvalsh(np.einsum("nij,nik->jk", unit, unit))
     if spread[0] < LEAST_TURNING * spread[-1]:
-        raise UnusableFlight(ReasonCode.NO_START, "The field turned about one axis only: it tells no start.")
+        raise UnusableFlight(ReasonCode.NO_START, "What turned did so about one axis only: it tells no start.")
 
     def solve(weight: Array) -> tuple[Array, Array]:
         root = np.sqrt(weight)[:, None]
