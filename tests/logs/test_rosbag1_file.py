@@ -6,6 +6,7 @@ import struct
 from collections import Counter
 from pathlib import Path
 
+import lz4.frame
 import pytest
 from rosbag1_records import chunk, field, length, message, record
 
@@ -189,6 +190,17 @@ def test_a_chunk_that_lacks_bytes_costs_itself_alone(tmp_path: Path) -> None:
             assert inside == b"".join(bytes([letter]) * 9 for letter in kept), (at, cut)
             assert len(kept) >= (at - begin) // len(messages[0]) - 1, (at, cut)
             assert f"the chunk lacks {cut} of its bytes" in read.told["damaged_chunk"]
+
+
+def test_a_packed_chunk_that_could_be_unpacked_lacks_nothing(tmp_path: Path) -> None:
+    """Although a message of it holds the bytes of a chunk, and what follows it is damaged."""
+    content = message(1, 3, 0, SECOND)
+    head = lz4.frame.compress(b"", store_size=False)[:-4]
+    stored_block = struct.pack("<I", len(content) | 1 << 31) + content
+    packed = chunk(head + stored_block + bytes(4), len(content), b"lz4")
+    read = Read(tmp_path, BEGIN + FIRST + packed + b"\xff" * 9 + SECOND)
+    assert read.blocks == [b"ab", SECOND, b"cd"]
+    assert f"the first at byte {len(BEGIN + FIRST + packed)} (" in read.told["damaged_chunk"]
 
 
 def test_reading_goes_on_where_a_damaged_record_ends_if_a_record_begins_there(tmp_path: Path) -> None:
