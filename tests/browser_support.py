@@ -55,11 +55,16 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     driver.quit()
 
 
+DRAWN = "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(done))"
+
+
 def show(browser: Any, path: Path | str, scheme: str = "light") -> None:
-    """Open a page in a colour scheme."""
+    """Open a page in a colour scheme, and wait for its first frame: on a busy machine it is loaded some time before,
+    and nothing of it is visible then."""
     features = [{"name": "prefers-color-scheme", "value": scheme}]
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "screen", "features": features})
     browser.get(path if isinstance(path, str) else path.as_uri())
+    browser.execute_async_script(DRAWN)
 
 
 def picture(browser: Any, name: str) -> np.ndarray:
