@@ -32,12 +32,10 @@ class KeptProcesses(processes.Processes):
             self.add()
 
     def release(self) -> None:
-        kept, self.free[:] = list(self.free), []
         if KeptProcesses.started_in == surroundings():
-            self.idle.extend(kept)
-        else:
-            for process in kept:
-                process.shutdown(wait=False, cancel_futures=True)
+            self.idle.extend(self.free)
+            self.free.clear()
+        super().release()
 
 
 def surroundings() -> Surroundings:

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 # Where gravity moved less than this in sensor axes, rms over the axes, in g, the accelerometer tells nothing of its
 # constants: they are held at those known beforehand, since translation would draw them along.
 LEAST_TILT = 0.15
-FROM_GIVEN = (Rung.FREE, Rung.TURNING_START, Rung.FIELD_ALONE)
-WITH_ARM = (Rung.FREE, Rung.TURNING_START, Rung.INERTIAL_START)
+FROM_GIVEN = (Rung.FREE, Rung.TURNING_START, Rung.FIELD_ALONE)  # the others start from what is known beforehand
+WITH_ARM = (Rung.FREE, Rung.TURNING_START, Rung.INERTIAL_START)  # these estimate the lever arm too
 HELD_SD = 1e-5  # of held constants, as a share of what is known of them
 
 

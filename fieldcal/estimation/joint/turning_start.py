@@ -47,11 +47,11 @@ def gyroscope_by_turning(readings: Readings, start: Mapping[str, Constants | Non
         `no_start`: neither vector with constants, or turning about one axis only.
     """
     t, segment = readings.t, readings.segment
-    lengths_of = {"magnetometer": float(np.linalg.norm(readings.field_ned)), "accelerometer": readings.gravity_mps2}
-    for name, length in lengths_of.items():
+    magnitudes = {"magnetometer": float(np.linalg.norm(readings.field_ned)), "accelerometer": readings.gravity_mps2}
+    for name, magnitude in magnitudes.items():
         logged, known = getattr(readings, name), start.get(name)
         if logged is not None and known is not None:
-            v = (filled(t, logged) * known[0] + known[1]) / abs(length)
+            v = (filled(t, logged) * known[0] + known[1]) / abs(magnitude)
             break
     else:
         raise UnusableFlight(ReasonCode.NO_START, "Neither a field nor gravity tells how fast it turned.")

@@ -209,10 +209,9 @@ class BagContainer:
     def _inside(self, chunk: Record) -> int | None:
         """Where the next chunk begins, if that is before the end that this one declares: bytes of it are missing. A
         packed one could not have been unpacked without them."""
-        packed = chunk.value(b"compression") != b"none"
-        if packed or chunk.end > self._limit or is_record(self._buffer, chunk.end, self._limit):
+        if chunk.end > self._limit or chunk.value(b"compression") != b"none":
             return None
-        found = next_chunk(self._buffer, chunk.data, self._limit)
+        found = self._behind(chunk.start)
         return found if found is not None and found < chunk.end else None
 
     def _define(self, buffer: Buffer, record: Record) -> None:

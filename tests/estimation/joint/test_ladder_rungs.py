@@ -67,7 +67,7 @@ class Climbed:
         return fit_with_fallbacks(readings, START, {name: PRIORS[name] for name in known}, lever_arm=lever_arm)
 
 
-START = {name: f"start of {name}" for name in EVERY}
+START: dict[str, Any] = {name: f"start of {name}" for name in EVERY}
 PRIORS = {name: PriorConstants(np.ones(3), np.zeros(3), np.diag(np.arange(1.0, 7.0) ** 2)) for name in EVERY}
 
 
@@ -157,7 +157,7 @@ def test_what_is_not_known_beforehand_has_three_rungs(monkeypatch: pytest.Monkey
         climbed.run(())
     assert len(climbed.asked) == 3
     with monkeypatch.context() as patch:
-        patch.setitem(START, "magnetometer", None)  # type: ignore[arg-type]
+        patch.setitem(START, "magnetometer", None)
         climbed = Climbed(patch)
         climbed.failing = (1, 2, 3)
         with pytest.raises(EstimationError, match="fit 1"):
