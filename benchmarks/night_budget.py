@@ -26,7 +26,6 @@ from fieldcal.batch import steps
 from fieldcal.batch.closing import close_night
 from fieldcal.batch.flights import one_flight
 from fieldcal.batch.night import plan_night, publishings
-from fieldcal.batch.steps import FlightWork
 from fieldcal.flight.threads import one_thread
 from fieldcal.report.fitness import Criteria
 from fieldcal.simulation.archive import write_flights
@@ -76,7 +75,7 @@ def main() -> None:
     given = arguments.parse_args()
     budget = Budget()
     budget.watch(steps, "run_stage", lambda stage, *_: f"mathematics: {stage.name}")
-    budget.watch(FlightWork, "_write_signals", lambda *_, **__: "read the log, write readings")
+    budget.watch(steps, "read_log", lambda *_, **__: "read the log, write readings")
     for name in ("save", "load", "complete", "latest"):
         budget.watch(StageStore, name, lambda *_, **__: "cache of stages")
     with one_thread(), tempfile.TemporaryDirectory() as folder:

@@ -1,10 +1,12 @@
-"""The night, and one session, as Prefect flows: plan → batches of flights (each step a task) → publish each vehicle."""
+"""The night, and one session, as Prefect flows: plan → batches of flights (each step a task) → publish each vehicle,
+as soon as all its flights are through."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from datetime import datetime
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
@@ -149,13 +151,16 @@ def carry_out(
     with alive(night.root), telling(night) as tell:
         if watcher is not None:
             watcher.planned(len(night.plan.jobs), len(night.plan.missing), len(night.plan.done))
-        outcomes = []
-        for outcome in night.unchanged():
-            outcomes.append(outcome)
-            if watcher is not None:
-                watcher.done(outcome)
-        outcomes += _calibrate(night, parallel, watcher, processes)
-        for publishing in publishings(night, outcomes):
+        outcomes: list[Outcome] = []
+
+        def coming() -> Iterator[Outcome]:
+            for outcome in chain(night.unchanged(), _calibrate(night, parallel, processes)):
+                outcomes.append(outcome)
+                if watcher is not None:
+                    watcher.done(outcome)
+                yield outcome
+
+        for publishing in publishings(night, coming()):
             publish_as_task(publishing)
         result, closing = end_night(night, outcomes, parallel.here())
         keep_artifact(result, night.root)
@@ -180,9 +185,7 @@ def failed_stages(result: NightDocument) -> State[Any] | None:
     return Failed(message=printable(told))
 
 
-def _calibrate(
-    night: Night, parallel: Parallel, watcher: Watcher | None, processes: Processes | None
-) -> Iterator[Outcome]:
+def _calibrate(night: Night, parallel: Parallel, processes: Processes | None) -> Iterator[Outcome]:
     """Outcomes of the flights with something missing, batch by batch."""
     root, code = str(night.root), code_digest()
     inputs: list[Batch] = [
@@ -193,10 +196,7 @@ def _calibrate(
         if isinstance(answer, Exception):
             say(f"Batch {given['number']} was lost ({type(answer).__name__}: {answer}); its logs follow one by one.")
             answer = _one_by_one(given)
-        for outcome in _outcomes(answer):
-            if watcher is not None:
-                watcher.done(outcome)
-            yield outcome
+        yield from _outcomes(answer)
 
 
 def _answers(night: Night, parallel: Parallel, inputs: list[Batch], processes: Processes | None) -> Answers:

@@ -44,7 +44,7 @@ def close_night(root: Path, criteria: Criteria, *, with_site: bool = True, worke
     Trends are regressed only where the history, or the code that makes them, is another than last time. The fleet is
     judged once: the site, the terminal and messages say the same. Reports: the fleet's page, and the pages of vehicles
     of which something is told; `fieldcal report` makes any other. The site has all of them, and of it only what changed
-    is written, by so many `workers`.
+    is written, by so many `workers`, who draw flights' pages while the trends are made.
 
     The history is held against its records first, so that no night ends well over damage that it had no need to read.
 
@@ -53,6 +53,10 @@ def close_night(root: Path, criteria: Criteria, *, with_site: bool = True, worke
     WarehouseError
         As `fieldcal.trends.drift_table.update_drift`; `damaged_file`, `busy`.
     """
+    from fieldcal.site.drawing import Drawing
+    from fieldcal.site.snapshot import Snapshot
+    from fieldcal.site.write import draw_ahead, write_pages
+
     now = datetime.now(UTC)
     with fleet_lock(root):
         refresh(root)
@@ -63,17 +67,17 @@ def close_night(root: Path, criteria: Criteria, *, with_site: bool = True, worke
         for vehicle_id in decisions(root)["vehicle_id"].unique().sort().to_list():
             settle(root, vehicle_id)  # where deciding was interrupted, rows do not follow yet
         made_from = _made_from(root)
-        if before.get("made_from") != made_from or before.get("made") != history_digest(root, FLEET_TABLES):
-            update_trends(root)
-            made_from = _made_from(root)
-        from fieldcal.site.snapshot import Snapshot
-        from fieldcal.site.write import write_pages
-
-        snapshot = Snapshot(root)
-        fleet = fleet_fitness(snapshot, criteria, now)
-        told = news(fleet, remembered_fleet(root))
-        report = _reports(root, told)
-        site = write_pages(snapshot, fleet, workers) if with_site else None
+        with Drawing(root, workers) as drawing:
+            if before.get("made_from") != made_from or before.get("made") != history_digest(root, FLEET_TABLES):
+                if with_site:
+                    draw_ahead(root, drawing)
+                update_trends(root)
+                made_from = _made_from(root)
+            snapshot = Snapshot(root)
+            fleet = fleet_fitness(snapshot, criteria, now)
+            told = news(fleet, remembered_fleet(root))
+            report = _reports(root, told)
+            site = write_pages(snapshot, fleet, drawing) if with_site else None
         made = history_digest(root, FLEET_TABLES)
         remember(root, fleet, criteria, {"made_from": made_from, "made": made})
         share(root)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Protocol, cast
@@ -117,14 +118,27 @@ class Publishing:
         return list(changed)
 
 
-def publishings(night: Night, outcomes: Sequence[Outcome]) -> Iterator[Publishing]:
-    """One a vehicle; flights that were published under another vehicle leave it."""
+def publishings(night: Night, outcomes: Iterable[Outcome]) -> Iterator[Publishing]:
+    """One a vehicle, as soon as the last outcome of its flights has come; flights that were published under another
+    vehicle leave it."""
     recorded = Warehouse(night.root).scan("flight").select("flight_id", "vehicle_id").collect()
-    for vehicle_id in sorted({outcome.job.vehicle_id for outcome in outcomes}):
-        flown = [outcome for outcome in outcomes if outcome.job.vehicle_id == vehicle_id]
-        ids = [outcome.job.flight_id for outcome in flown]
-        elsewhere = recorded.filter(pl.col("flight_id").is_in(ids) & (pl.col("vehicle_id") != vehicle_id))
-        moved: dict[str, set[str]] = {}
-        for flight_id, former in elsewhere.iter_rows():
-            moved.setdefault(former, set()).add(flight_id)
-        yield Publishing(night.root, vehicle_id, night.configuration, flown, moved)
+    come = night.plan.missing.keys() | night.plan.unchanged.keys()
+    due = Counter(job.vehicle_id for job in night.plan.jobs if job.flight_id in come)
+    flown: dict[str, list[Outcome]] = {}
+    for outcome in outcomes:
+        vehicle_id = outcome.job.vehicle_id
+        own = flown.setdefault(vehicle_id, [])
+        own.append(outcome)
+        if len(own) == due[vehicle_id]:
+            yield _publishing(night, vehicle_id, flown.pop(vehicle_id), recorded)
+    for vehicle_id in sorted(flown):
+        yield _publishing(night, vehicle_id, flown[vehicle_id], recorded)
+
+
+def _publishing(night: Night, vehicle_id: str, flown: Sequence[Outcome], recorded: pl.DataFrame) -> Publishing:
+    ids = [outcome.job.flight_id for outcome in flown]
+    elsewhere = recorded.filter(pl.col("flight_id").is_in(ids) & (pl.col("vehicle_id") != vehicle_id))
+    moved: dict[str, set[str]] = {}
+    for flight_id, former in elsewhere.iter_rows():
+        moved.setdefault(former, set()).add(flight_id)
+    return Publishing(night.root, vehicle_id, night.configuration, flown, moved)

@@ -41,16 +41,30 @@ def stage_source(stage: Stage) -> str:
 
 def know_sources(root: Path, *, keep: bool) -> None:
     """Take the digests that the root remembers of this very code; else work them out and, with `keep`, remember."""
-    place = root / "night" / "sources.json"
-    try:
-        found = unseal(place.read_bytes())
-        digests = found["sources"]
-        if found["code"] == code_digest() and isinstance(digests, dict) and set(digests) == set(NAMES):
-            _known.update({name: str(digest) for name, digest in digests.items()})
-            return
-    except (OSError, BrokenSeal, KeyError):
-        pass
-    if keep:
-        write_bytes(place, seal({"code": code_digest(), "sources": dict(sources())}), durable=False)
+    found = _remembered(root)
+    if found is not None:
+        _known.update(found)
+    elif keep:
+        write_bytes(_place(root), seal({"code": code_digest(), "sources": dict(sources())}), durable=False)
     else:
         sources()
+
+
+def is_new_to(root: Path) -> bool:
+    """Whether this code has run no night of the root yet: the next plans for seconds, and most likely has work."""
+    return _remembered(root) is None
+
+
+def _remembered(root: Path) -> dict[str, str] | None:
+    try:
+        found = unseal(_place(root).read_bytes())
+        digests = found["sources"]
+        if found["code"] == code_digest() and isinstance(digests, dict) and set(digests) == set(NAMES):
+            return {name: str(digest) for name, digest in digests.items()}
+    except (OSError, BrokenSeal, KeyError):
+        pass
+    return None
+
+
+def _place(root: Path) -> Path:
+    return root / "night" / "sources.json"

@@ -8,20 +8,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import cast
 
 import polars as pl
 
 from fieldcal.batch.limits import why_ended
+from fieldcal.batch.reading import read_log
 from fieldcal.batch.reasons import NO_RESULT, why_it_runs
 from fieldcal.batch.sources import sources
 from fieldcal.config.configuration import Limits, Vehicle
 from fieldcal.config.flight_settings import FlightSettings
 from fieldcal.config.reader_settings import reader_settings
 from fieldcal.config.stage_settings import as_json, taken_from
-from fieldcal.errors import UnreadableLog, unforeseen
+from fieldcal.errors import unforeseen
 from fieldcal.flight.job import Job, file_stamp
 from fieldcal.flight.record import Causes, Output, Record
 from fieldcal.flight.stage_tables import STAGES, StageTables
@@ -30,11 +31,9 @@ from fieldcal.flight.versions import versions
 from fieldcal.logs import ingest
 from fieldcal.logs.facts import Facts
 from fieldcal.logs.on_board import PRIMARY, signals_of
-from fieldcal.logs.tidy import Disordered
 from fieldcal.names import Json, Status, Verdict
 from fieldcal.provenance.run_key import run_key
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.remote.content import here
 from fieldcal.remote.url import RemoteError
 from fieldcal.stages.pipeline import INGEST, PIPELINE
 from fieldcal.stages.results import StageResult, plain
@@ -43,9 +42,7 @@ from fieldcal.warehouse.checksums import problem
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.files import file_sha256
 from fieldcal.warehouse.layout import checksum_path, signal_path
-from fieldcal.warehouse.signals import signal_writer
 from fieldcal.warehouse.stage_store import StageStore, outputs_of
-from fieldcal.warehouse.store import TableWriter
 
 STEPS = (INGEST, *(stage.name for stage in PIPELINE))
 """Of the primary unit."""
@@ -87,7 +84,8 @@ class FlightWork:
         self._settings: FlightSettings | None = None
         self._inputs: dict[str, str] = {}
         self._made_of: dict[str, Causes] = {}
-        self._tables = StageTables(root, job.vehicle_id, job.flight_id, self.records, table, self._read_again)
+        read_again = partial(read_log, root, job, vehicle)
+        self._tables = StageTables(root, job.vehicle_id, job.flight_id, self.records, table, read_again)
 
     def usable(self) -> bool:
         """Whether ingest left anything to calibrate on; known once its record is."""
@@ -215,7 +213,7 @@ class FlightWork:
         if self.job.problem is not None:
             return self._ingest_record(ingest.rejected(ReasonCode.NOT_READABLE, self.job.problem), {}, key, keep=False)
         try:
-            facts, signals = self._read()
+            facts, signals = read_log(self._root, self.job, self._vehicle)
         except RemoteError as error:
             return self._ingest_record(ingest.rejected(error.reason_code, error.sentence), {}, key, keep=False)
         except WarehouseError:
@@ -228,38 +226,6 @@ class FlightWork:
             why = f"{self.job.log_uri} changed while it was read; the next night takes it when it is complete."
             return self._ingest_record(ingest.rejected(ReasonCode.CHANGED_WHILE_READ, why), {}, key, keep=False)
         return self._ingest_record(facts, signals, key, keep=facts["reason_code"] != ingest.TOO_SLOW)
-
-    def _read(self) -> tuple[Facts, dict[str, Output]]:
-        """Read the log into the signal tables."""
-        with here(Path(self.job.path)):
-            try:
-                return self._write_signals(whole=False)
-            except Disordered:
-                return self._write_signals(whole=True)
-
-    def _write_signals(self, *, whole: bool) -> tuple[Facts, dict[str, Output]]:
-        """Stream the log into the signal tables; nothing appears unless the whole log came through."""
-        writers: dict[str, TableWriter] = {}
-        try:
-            with ExitStack() as stack:
-                path, units = Path(self.job.path), None
-                log = ingest.tidy_log(path, self._vehicle, whole=whole)
-                for table, frame in log.tables():
-                    if table not in writers:
-                        units = units or log.units() or ingest.logged_units(path, self._vehicle)
-                        writers[table] = stack.enter_context(self._writer(table, units))
-                    writers[table].write(frame)
-                facts = log.facts()
-                if facts["verdict"] == Verdict.QUARANTINED:
-                    raise _Quarantined(facts)
-        except _Quarantined as stop:
-            return stop.facts, {}
-        except UnreadableLog as error:
-            return ingest.rejected(error.reason_code, error.sentence), {}
-        return facts, {name: {"sha256": w.sha256, "rows": w.n_rows} for name, w in sorted(writers.items())}
-
-    def _writer(self, table: str, units: Mapping[str, str]) -> TableWriter:
-        return signal_writer(self._root, table, self.job.vehicle_id, self.job.flight_id, units=units)
 
     def _ingest_record(self, facts: Facts, signals: dict[str, Output], key: str, *, keep: bool) -> Record:
         status = Status.OK if Verdict(facts["verdict"]).usable else Status.REFUSED
@@ -283,10 +249,6 @@ class FlightWork:
 
     def _signal_paths(self, record: Record) -> dict[str, Path]:
         return {t: signal_path(self._root, t, self.job.vehicle_id, self.job.flight_id) for t in record["signals"]}
-
-    def _read_again(self) -> None:
-        """Read the log once more: readings that are needed were removed."""
-        self._read()
 
     # --- stages
 
@@ -314,12 +276,6 @@ class FlightWork:
 
 def _stage_of(step: str) -> Stage:
     return STAGES[stage_and_unit(step)[0]]
-
-
-class _Quarantined(Exception):
-    def __init__(self, facts: Facts) -> None:
-        super().__init__(facts["reason"])
-        self.facts = facts
 
 
 def _record(

@@ -35,7 +35,8 @@ class StageTables:
     table : str
         The unit, by the table of its readings.
     read_again : callable, optional
-        Has the log read once more, for readings that were removed to make room.
+        Has the log read once more, for readings that were removed to make room. It holds nothing that holds these
+        tables: they are given up with the last that asks, not some time later.
     """
 
     def __init__(
@@ -45,7 +46,7 @@ class StageTables:
         flight_id: str,
         records: Mapping[str, Record],
         table: str = PRIMARY,
-        read_again: Callable[[], None] | None = None,
+        read_again: Callable[[], object] | None = None,
     ) -> None:
         self._root, self._vehicle_id, self._flight_id = root, vehicle_id, flight_id
         self._records, self._unit, self._read_again = records, table, read_again

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 from fieldcal.flight.processes import end_with_parent
 from fieldcal.report.fitness import Fitness
 from fieldcal.report.links import Links
-from fieldcal.site.ledger import Ledger, Written, flight_digest
+from fieldcal.site.ledger import Files, Ledger, Written, flight_digest, flights_digest
 from fieldcal.site.snapshot import Snapshot
 from fieldcal.site.vehicle_pages import flight_files, vehicle_files
 
@@ -22,28 +24,77 @@ FLIGHTS_WORTH_A_PROCESS = 60
 
 @dataclass(frozen=True)
 class Due:
-    """A vehicle whose pages show something else than the history: `of`, the digest of what they are made from now."""
+    """A vehicle some of whose pages show something else than the history. Without `fitness` only its flights' are
+    drawn, which show nothing of the fleet; else `of` is the digest of what all are made from now."""
 
-    fitness: Fitness
+    vehicle_id: str
     flights: tuple[str, ...]
-    of: str
+    fitness: Fitness | None = None
+    of: str = ""
 
 
-def draw(snapshot: Snapshot, due: Sequence[Due], links: Links, code: str, workers: int) -> None:
-    """Write what changed of these vehicles, and remember it in their ledgers.
+class Drawing:
+    """Draws pages, with processes where there are flights enough for two of them at least; they end with the block.
 
-    Processes share whole vehicles. Where one is killed, for want of memory say, what is left is drawn here.
+    Parameters
+    ----------
+    root : Path
+        Data root.
+    workers : int
+        How many processes at most.
     """
-    shares = _shares(due, min(workers, sum(len(one.flights) for one in due) // FLIGHTS_WORTH_A_PROCESS))
-    if len(shares) > 1:
+
+    def __init__(self, root: Path, workers: int) -> None:
+        self._root, self._workers = root, workers
+        self._pool: ProcessPoolExecutor | None = None
+        self._ahead: list[Future[None]] = []
+
+    def begin(self, due: Sequence[Due], links: Links, code: str) -> None:
+        """Have processes draw, if they are worth it, and come back at once; the next `draw` waits for them."""
+        self._ahead = self._given(due, links, code)
+
+    def draw(self, snapshot: Snapshot, due: Sequence[Due], links: Links, code: str) -> None:
+        """Write what changed of these vehicles, and remember it in their ledgers.
+
+        Processes share whole vehicles. Where one is killed, for want of memory say, what is left is drawn here.
+        """
         try:
-            with ProcessPoolExecutor(len(shares), get_context("spawn"), end_with_parent) as pool:
-                for drawn in [pool.submit(_draw_alone, snapshot.root, share, links, code) for share in shares]:
-                    drawn.result()
-            return
+            _await(self._ahead)
+            given = self._given(due, links, code)
+            _await(given)
+            if given:
+                return
         except BrokenProcessPool:
-            pass
-    _draw_each(snapshot, due, links, code)
+            self._end()
+        _draw_each(snapshot, due, links, code)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end()
+
+    def _end(self) -> None:
+        self._ahead = []
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
+
+    def _given(self, due: Sequence[Due], links: Links, code: str) -> list[Future[None]]:
+        number = min(self._workers, sum(len(one.flights) for one in due) // FLIGHTS_WORTH_A_PROCESS)
+        shares = _shares(due, number)
+        if len(shares) < 2:
+            return []
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(self._workers, get_context("spawn"), end_with_parent)
+        return [self._pool.submit(_draw_alone, self._root, share, links, code) for share in shares]
+
+
+def _await(drawn: Sequence[Future[None]]) -> None:
+    for one in drawn:
+        one.result()
 
 
 def _shares(due: Sequence[Due], number: int) -> list[list[Due]]:
@@ -65,14 +116,19 @@ def _draw_each(snapshot: Snapshot, due: Sequence[Due], links: Links, code: str) 
 
 
 def _draw(snapshot: Snapshot, due: Due, links: Links, written: Written, code: str) -> None:
-    """The vehicle's pages and its flights', where what they show, or the code that makes them, is another."""
-    vehicle_id = due.fitness.vehicle_id
-    ledger = Ledger.of_vehicle(snapshot.root, vehicle_id)
-    seen = {}
+    """Its flights' pages, then the vehicle's, where what they show, or the code that makes them, is another."""
+    ledger = Ledger.of_vehicle(snapshot.root, due.vehicle_id)
+    drawn_of = flights_digest(snapshot.root, due.vehicle_id, due.flights, code)
+    seen: dict[str, tuple[str, Files]] = {}
     for flight_id in due.flights:
-        digest = flight_digest(snapshot, vehicle_id, flight_id, code)
         files = ledger.of_flights.get(flight_id, {})
-        if ledger.flights.get(flight_id) != digest or not written.has(files):
-            files = written.put(flight_files(snapshot, vehicle_id, flight_id, links), files)
+        there, digest = written.has(files), ledger.flights.get(flight_id, "")
+        if not there or ledger.drawn_of != drawn_of:
+            former, digest = digest, flight_digest(snapshot, due.vehicle_id, flight_id, code)
+            if not there or digest != former:
+                files = written.put(flight_files(snapshot, due.vehicle_id, flight_id, links), files)
         seen[flight_id] = (digest, files)
-    ledger.remember(due.of, written.put(vehicle_files(snapshot, due.fitness, links), ledger.files), seen)
+    of, own = ledger.of, ledger.files
+    if due.fitness is not None:
+        of, own = due.of, written.put(vehicle_files(snapshot, due.fitness, links), own)
+    ledger.remember(of, own, drawn_of, seen)

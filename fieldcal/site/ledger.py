@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -27,11 +27,13 @@ Files = Mapping[str, tuple[str, int]]
 
 
 class Ledger:
-    """Of one vehicle: digests of what its pages were made from, and which files they are."""
+    """Of one vehicle: digests of what its pages were made from, and which files they are. `drawn_of` is the one of all
+    its flights' pages together."""
 
     def __init__(self, root: Path, vehicle_id: str) -> None:
-        self.vehicle_id = vehicle_id
+        self.root, self.vehicle_id = root, vehicle_id
         self.of = ""
+        self.drawn_of = ""
         self.files: Files = {}
         self.flights: Mapping[str, str] = {}
         self.of_flights: Mapping[str, Files] = {}
@@ -53,11 +55,11 @@ class Ledger:
         self.files = _files(cast(Mapping[str, list[str | int]], told["files"]))
         self.flights = {flight_id: own[0] for flight_id, own in flights.items()}
         self.of_flights = {flight_id: _files(own[1]) for flight_id, own in flights.items()}
-        self.of = str(told["of"])
+        self.of, self.drawn_of = str(told["of"]), str(told["drawn_of"])
 
-    def remember(self, of: str, files: Files, flights: Mapping[str, tuple[str, Files]]) -> None:
+    def remember(self, of: str, files: Files, drawn_of: str, flights: Mapping[str, tuple[str, Files]]) -> None:
         """Remember, once all is written."""
-        told = {"vehicle_id": self.vehicle_id, "of": of, "files": files, "flights": flights}
+        told = {"vehicle_id": self.vehicle_id, "of": of, "files": files, "drawn_of": drawn_of, "flights": flights}
         write_bytes(self._path, seal(told), durable=False)
         self._fill(cast(Mapping[str, Json], json.loads(json.dumps(told))))
 
@@ -136,16 +138,24 @@ def vehicle_digest(snapshot: Snapshot, one: Fitness, code: str) -> str:
     that of others that carried its units."""
     told = [code, one.standing, *one.reasons, *(note.sentence for note in one.notes), one.next]
     for vehicle_id in snapshot.sharing_units(one.vehicle_id):
-        for table in HISTORY_TABLES:
-            record = checksum_path(snapshot.root, history_path(snapshot.root, table, vehicle_id))
-            told.append(f"{table} {record.read_bytes().hex() if record.exists() else None}")
+        told += [_record(snapshot.root, table, vehicle_id) for table in HISTORY_TABLES]
     return _joined(told)
+
+
+def flights_digest(root: Path, vehicle_id: str, flights: Sequence[str], code: str) -> str:
+    """Digest of all that the pages of these flights of a vehicle show, by the records of its history."""
+    return _joined([code, vehicle_id, *flights, *(_record(root, table, vehicle_id) for table in OF_FLIGHT)])
 
 
 def flight_digest(snapshot: Snapshot, vehicle_id: str, flight_id: str, code: str) -> str:
     """Digest of all that a flight's page shows."""
     rows = (snapshot.scan(table, vehicle_id=vehicle_id, flight_id=flight_id).collect() for table in OF_FLIGHT)
     return _joined([code, vehicle_id, *(f"{of.columns}{of.rows()}" for of in rows)])
+
+
+def _record(root: Path, table: str, vehicle_id: str) -> str:
+    record = checksum_path(root, history_path(root, table, vehicle_id))
+    return f"{table} {record.read_bytes().hex() if record.exists() else None}"
 
 
 def _joined(texts: list[str]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -13,6 +13,7 @@ import fieldcal
 from fieldcal.batch.flights import one_flight
 from fieldcal.batch.ledgers import flights as seen
 from fieldcal.batch.night import Night, plan_night, publishings
+from fieldcal.batch.outcome import Outcome
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 
@@ -55,6 +56,22 @@ def fleet(grown: Path, tmp_path: Path) -> Fleet:
     fleet = Fleet(tmp_path / "fleet")
     fleet.night()
     return fleet
+
+
+def test_a_vehicle_is_published_as_soon_as_its_flights_are_through(grown: Path, tmp_path: Path) -> None:
+    archive, root = grown / "archive", tmp_path / "data"
+    night = plan_night(archive, root)
+    made = [one_flight(root, job, night.configuration) for job in night.missing()]
+    come: list[str] = []
+
+    def coming() -> Iterator[Outcome]:
+        for outcome in made:
+            come.append(outcome.job.vehicle_id)
+            yield outcome
+
+    published = [(one.vehicle_id, len(one.outcomes), len(come)) for one in publishings(night, coming())]
+    assert published == [("sim-1", 1, 1), ("sim-2", 1, 2)]
+    assert [(one.vehicle_id, len(one.outcomes)) for one in publishings(night, made[1:])] == [("sim-2", 1)]
 
 
 def test_nothing_is_looked_at_twice_and_the_same_is_said(fleet: Fleet) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +56,18 @@ def test_it_is_made_again_as_it_was(flown: Archive) -> None:
         assert digest(tables[f"{stage}.{table}"]) == output["sha256"]
     with pytest.raises(KeyError):
         tables["smoothing.nothing"]
+
+
+def test_a_flight_s_tables_are_given_up_with_it(flown: Archive) -> None:
+    """Not when garbage is next looked for: by then a process would hold many flights."""
+    work = flown.done()
+    there = weakref.ref(work)
+    gc.disable()
+    try:
+        del work
+        assert there() is None
+    finally:
+        gc.enable()
 
 
 def test_what_is_missing_runs_alone_on_tables_that_are_made_again(flown: Archive) -> None:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import fieldcal.flows.run as module
+from fieldcal.batch import night
 from fieldcal.batch.documents import NightDocument
+from fieldcal.batch.night import Night, plan_night
 from fieldcal.flows.run import run_night
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
@@ -80,3 +84,32 @@ def test_a_new_log_has_a_server_started(
     monkeypatch.setattr(module, "running_server", lambda root: (_ for _ in ()).throw(RuntimeError("started")))
     with pytest.raises(RuntimeError, match="started"):
         run_night(archive, root)
+
+
+def test_code_that_is_new_has_a_server_start_while_it_plans_and_needs_none_where_nothing_is_new(
+    flown: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive, root = flown
+    run_night(archive, root)
+    monkeypatch.delenv("PREFECT_API_URL")
+    planned = plan_night(archive, root)
+    assert not planned.has_work()
+    told: list[str] = []
+
+    @contextmanager
+    def server(_: Path) -> Iterator[None]:
+        told.append("started")
+        yield
+        told.append("ended")
+
+    def plan(*given: Any) -> Night:
+        told.append("planned")
+        return planned
+
+    monkeypatch.setattr(module, "running_server", server)
+    monkeypatch.setattr(night, "plan_night", plan)
+    run_night(archive, root)
+    assert told == ["planned"]
+    (root / "night" / "sources.json").unlink()
+    assert run_night(archive, root)["server_seconds"] == 0.0
+    assert told == ["planned", "started", "planned", "ended"]

@@ -39,10 +39,11 @@ from fieldcal.simulation.experiment import Experiment
 from fieldcal.site import drawing, write_site
 from fieldcal.site.charts import numbers
 from fieldcal.site.downloads import ENDINGS
+from fieldcal.site.drawing import Drawing
 from fieldcal.site.flight_charts import SHARES, STEPS_OF_A_RANGE, envelope, rounded
 from fieldcal.site.pages import ASSETS, asset
 from fieldcal.site.snapshot import Snapshot
-from fieldcal.site.write import write_pages
+from fieldcal.site.write import draw_ahead, write_pages
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.publish import publish
 from fieldcal.warehouse.upkeep.verify import verify
@@ -396,13 +397,40 @@ def test_processes_that_share_the_vehicles_write_the_same_site(fleet: Path, tmp_
     monkeypatch.setattr(drawing, "FLIGHTS_WORTH_A_PROCESS", 1)
     alone = content(fleet)
     assert len(alone) > 30
-    for name in ("shared", "killed"):
-        shutil.copytree(fleet, tmp_path / name, ignore=shutil.ignore_patterns("site"))
+    for name in ("shared", "ahead", "killed"):
+        root = tmp_path / name
+        shutil.copytree(fleet, root, ignore=shutil.ignore_patterns("site"))
         if name == "killed":
             monkeypatch.setattr(drawing, "ProcessPoolExecutor", Killed)
-        snapshot = Snapshot(tmp_path / name)
-        write_pages(snapshot, fleet_fitness(snapshot, Criteria(Alerts(expires_days=1e5)), NOW), 2)
-        assert content(tmp_path / name) == alone
+        snapshot = Snapshot(root)
+        with Drawing(root, 2) as own:
+            if name != "shared":
+                draw_ahead(root, own)
+            write_pages(snapshot, fleet_fitness(snapshot, Criteria(Alerts(expires_days=1e5)), NOW), own)
+        assert content(root) == alone
+
+
+def test_pages_of_flights_that_were_drawn_ahead_are_not_drawn_again(
+    fleet: Path, tmp_path: Path, monkeypatch: Any
+) -> None:
+    """Nor are they looked at one by one where only the vehicle's page has become another."""
+    shutil.copytree(fleet, tmp_path / "data", ignore=shutil.ignore_patterns("site"))
+    snapshot = Snapshot(tmp_path / "data")
+    fitness = fleet_fitness(snapshot, Criteria(Alerts(expires_days=1e5)), NOW)
+    monkeypatch.setattr(drawing, "FLIGHTS_WORTH_A_PROCESS", 1)
+    with Drawing(tmp_path / "data", 2) as own:
+        draw_ahead(tmp_path / "data", own)
+    first = stamps(tmp_path / "data")
+    flights = snapshot.scan("flight").collect()["flight_id"].to_list()
+    assert {name for name in first if name.endswith(".html")} == {flight_name(one) for one in flights}
+    monkeypatch.setattr(drawing, "flight_digest", None)
+    monkeypatch.setattr(drawing, "flight_files", None)
+    with Drawing(tmp_path / "data", 1) as own:
+        draw_ahead(tmp_path / "data", own)
+        write_pages(snapshot, fitness, own)
+    later = changed(first, stamps(tmp_path / "data"))
+    assert {"index.html", *(vehicle_name(one) for one in fitness)} <= later
+    assert not {name for name in later if "flight-" in name}
 
 
 def test_numbers_have_seven_digits_and_no_infinity() -> None:
