@@ -19,7 +19,7 @@ from typing import Any, Self
 from fieldcal.batch.documents import Answer, Batch
 from fieldcal.batch.flights import flights
 from fieldcal.batch.limits import notes
-from fieldcal.flight.processes import end_with_parent
+from fieldcal.flight.processes import one_of_many
 from fieldcal.flows.farewell import tell_while_heard
 from fieldcal.flows.runners import Answers, answer_of
 
@@ -43,7 +43,7 @@ class Processes:
 
     def add(self) -> None:
         """Start one more."""
-        process = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=end_with_parent)
+        process = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=one_of_many)
         process.submit(_import)
         self.free.append(process)
 

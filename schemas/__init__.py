@@ -9,6 +9,7 @@ if __name__ != "fieldcal.schemas":  # a checkout has this folder at its root too
 
 from fieldcal.schemas.arrow import SchemaMismatch, arrow_schema, check, conform
 from fieldcal.schemas.column import AS_LOGGED, Column, Table
+from fieldcal.schemas.frames import fits
 from fieldcal.schemas.tables import (
     FLEET_TABLES,
     FLIGHT_TABLES,
@@ -36,6 +37,7 @@ __all__ = [
     "arrow_schema",
     "check",
     "conform",
+    "fits",
     "signal_kind",
     "stage_columns",
     "table_columns",

@@ -18,6 +18,7 @@ import polars as pl
 
 from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas import fits
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import prepare, stage_folder
@@ -106,7 +107,7 @@ class StageStore:
             if table in handed_on:
                 outputs[table] = {"sha256": digest(rows), "rows": rows.height, "handed_on": True}
             elif rows.height * rows.width <= MOST_VALUES_INSIDE:
-                whole = frame(conform(rows, table, stage=True))
+                whole = rows if fits(rows, table, stage=True) else frame(conform(rows, table, stage=True))
                 outputs[table] = {"sha256": digest(whole), "rows": rows.height, "columns": as_json(whole)}
             else:
                 path = folder / f"{table}.parquet"

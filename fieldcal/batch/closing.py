@@ -42,9 +42,10 @@ def close_night(root: Path, criteria: Criteria, *, with_site: bool = True, worke
     """Bring trends and reports up to the history; what is to be told tonight that was not told before.
 
     Trends are regressed only where the history, or the code that makes them, is another than last time. The fleet is
-    judged once: the site, the terminal and messages say the same. Reports: the fleet's page, and the pages of vehicles
-    of which something is told; `fieldcal report` makes any other. The site has all of them, and of it only what changed
-    is written, by so many `workers`, who draw flights' pages while the trends are made.
+    judged once: the site, the terminal and messages say the same. Of the site, which has a page of everything, only
+    what changed is written, by so many `workers`, who draw flights' pages while the trends are made. Of reports the
+    fleet's page is written, and without a site the pages of vehicles of which something is told; `fieldcal report`
+    makes any.
 
     The history is held against its records first, so that no night ends well over damage that it had no need to read.
 
@@ -53,6 +54,7 @@ def close_night(root: Path, criteria: Criteria, *, with_site: bool = True, worke
     WarehouseError
         As `fieldcal.trends.drift_table.update_drift`; `damaged_file`, `busy`.
     """
+    from fieldcal.report import write_night_reports
     from fieldcal.site.drawing import Drawing
     from fieldcal.site.snapshot import Snapshot
     from fieldcal.site.write import draw_ahead, write_pages
@@ -76,19 +78,19 @@ def close_night(root: Path, criteria: Criteria, *, with_site: bool = True, worke
             snapshot = Snapshot(root)
             fleet = fleet_fitness(snapshot, criteria, now)
             told = news(fleet, remembered_fleet(root))
-            report = _reports(root, told)
             site = write_pages(snapshot, fleet, drawing) if with_site else None
+            pages: list[str] = [] if with_site else _to_read(told)
+            report = write_night_reports(root, pages, fleet if with_site else ())[0]
         made = history_digest(root, FLEET_TABLES)
         remember(root, fleet, criteria, {"made_from": made_from, "made": made})
         share(root)
         return Closing(told, report, site)
 
 
-def _reports(root: Path, told: Sequence[Change]) -> Path:
-    from fieldcal.report import write_night_reports
-
-    vehicles = list(dict.fromkeys(change.vehicle_id for change in told if change.kind not in ("expired", "idle")))
-    return write_night_reports(root, vehicles[:MOST_PAGES])[0]
+def _to_read(told: Sequence[Change]) -> list[str]:
+    """Vehicles of which something is told that their page shows."""
+    vehicles = dict.fromkeys(change.vehicle_id for change in told if change.kind not in ("expired", "idle"))
+    return list(vehicles)[:MOST_PAGES]
 
 
 def _forget_damaged(root: Path) -> None:

@@ -9,7 +9,7 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from fieldcal.report.page import link
-from fieldcal.warehouse.layout import encode_id
+from fieldcal.warehouse.layout import SITE, encode_id
 
 FLEET = "fleet.html"
 
@@ -26,15 +26,19 @@ def flight_name(flight_id: str) -> str:
 
 @dataclass(frozen=True)
 class Links:
-    """Links from a report in `folder`; `expected` names files that will be written there too, `fleet` the fleet's."""
+    """Links from a report in `folder`; `expected` names files that will be written there too, `fleet` the fleet's, and
+    `on_site` pages of the site beside the folder, for what has no report."""
 
     folder: Path
     expected: frozenset[str] = frozenset()
     fleet: str = FLEET
+    on_site: frozenset[str] = frozenset()
 
     def to(self, name: str, text: str) -> str | Markup:
         """`text` as a link to the report `name`, or the plain text where there is none."""
-        return link(quote(name), text) if self._there(name) else text
+        if self._there(name):
+            return link(quote(name), text)
+        return link(f"../{SITE}/{quote(name)}", text) if name in self.on_site else text
 
     def up(self) -> tuple[str, str] | None:
         """The fleet page, as a page's `up`."""

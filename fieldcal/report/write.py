@@ -13,7 +13,7 @@ from fieldcal.report.links import FLEET, Links, flight_name, vehicle_name
 from fieldcal.report.page import Page, html
 from fieldcal.warehouse.checksums import problem, recording
 from fieldcal.warehouse.files import write_bytes
-from fieldcal.warehouse.layout import prepare
+from fieldcal.warehouse.layout import SITE, prepare
 
 if TYPE_CHECKING:
     from fieldcal.flight.calibrate import CalibratedLog
@@ -55,24 +55,36 @@ def write_flight_report(root: Path, flight_id: str) -> Path:
     return flight_report(root, flight_id)
 
 
-def write_night_reports(root: Path, vehicles: Collection[str], *, as_of: datetime | None = None) -> list[Path]:
-    """Write the pages of `vehicles` and the fleet's, linked to each other; paths, the fleet's first."""
+def write_night_reports(
+    root: Path, vehicles: Collection[str], on_site: Collection[str] = (), *, as_of: datetime | None = None
+) -> list[Path]:
+    """Write the pages of `vehicles` and the fleet's, linked to each other and to pages of vehicles `on_site`; paths,
+    the fleet's first."""
     expected = frozenset({FLEET, *(vehicle_name(vehicle) for vehicle in vehicles)})
     own = [
         vehicle_report(root, vehicle, _place(root, vehicle_name(vehicle)), as_of=as_of, expected=expected)
         for vehicle in sorted(vehicles)
     ]
-    return [fleet_report(root, _place(root, FLEET), as_of=as_of, expected=expected), *own]
+    beside = frozenset(map(vehicle_name, on_site))
+    return [fleet_report(root, _place(root, FLEET), as_of=as_of, expected=expected, on_site=beside), *own]
 
 
 def fleet_report(
-    root: Path, path: Path | None, *, as_of: datetime | None = None, expected: frozenset[str] = frozenset()
+    root: Path,
+    path: Path | None,
+    *,
+    as_of: datetime | None = None,
+    expected: frozenset[str] = frozenset(),
+    on_site: frozenset[str] | None = None,
 ) -> Path:
-    """The fleet's page in the file `path` (default below ROOT/reports)."""
+    """The fleet's page in the file `path` (default below ROOT/reports, where it links to the site)."""
     from fieldcal.report.fleet import fleet_page
 
     path = path or _place(root, FLEET)
-    return _write(path, fleet_page(root, Links(path.parent, expected), as_of))
+    if on_site is None:
+        there = (root / SITE).glob("vehicle-*.html") if path == _place(root, FLEET) else ()
+        on_site = frozenset(page.name for page in there)
+    return _write(path, fleet_page(root, Links(path.parent, expected, on_site=on_site), as_of))
 
 
 def vehicle_report(

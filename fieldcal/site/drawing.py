@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from fieldcal.flight.processes import end_with_parent
+from fieldcal.flight.processes import one_of_many
 from fieldcal.report.fitness import Fitness
 from fieldcal.report.links import Links
 from fieldcal.site.ledger import Files, Ledger, Written, flight_digest, flights_digest
@@ -88,7 +88,7 @@ class Drawing:
         if len(shares) < 2:
             return []
         if self._pool is None:
-            self._pool = ProcessPoolExecutor(self._workers, get_context("spawn"), end_with_parent)
+            self._pool = ProcessPoolExecutor(self._workers, get_context("spawn"), one_of_many)
         return [self._pool.submit(_draw_alone, self._root, share, links, code) for share in shares]
 
 

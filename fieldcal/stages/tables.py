@@ -93,12 +93,12 @@ def constants(
 ) -> tuple[Array, Array] | None:
     """(Λ (3, 3), b (3,)) of a sensor from `calibration` rows; None where there are none, or (normally) one is
     refused."""
-    rows = calibration.filter(pl.col("sensor") == sensor)
-    if method is not None:
-        rows = rows.filter(pl.col("method") == method)
-    if rows.is_empty() or (not refused_too and (rows["status"] != Status.OK).any()):
+    asked = ("sensor", "method", "status", "parameter", "axis", "value")
+    every = zip(*(calibration[name].to_list() for name in asked), strict=True)
+    rows = [own for its, by, *own in every if its == sensor and method in (None, by)]
+    if not rows or (not refused_too and any(status != Status.OK for status, *_ in rows)):
         return None
-    value = {(p, a): v for p, a, v in rows.select("parameter", "axis", "value").iter_rows()}
+    value = {(parameter, axis): v for _, parameter, axis, v in rows}
     bias = np.array([value["bias", a] for a in AXES], dtype=float)
     if ("scale", "xy") in value:
         scale = np.array([[value["scale", r + c] for c in AXES] for r in AXES], dtype=float)

@@ -20,6 +20,7 @@ from fieldcal.report.fitness import Criteria, Fitness, fleet_fitness
 from fieldcal.report.standing.memory import remembered_criteria, remembered_fleet
 from fieldcal.report.standing.news import news
 from fieldcal.report.standing.reason import EXPIRED, IDLE, Reason
+from fieldcal.report.write import write_vehicle_report
 from fieldcal.schemas import TABLES
 from fieldcal.trends.drift_table import update_drift
 from fieldcal.warehouse import Warehouse, WarehouseError
@@ -129,7 +130,10 @@ def test_a_young_fleet_is_told_what_so_few_sessions_tell_in_every_place_alike(
     assert {v for v, one in fitness.items() if one.standing != Standing.FINE} == {"v00"}
     (reason,) = fitness["v00"].reasons
     assert change.sentence == f"v00, imu-00: {reason}"
-    for path in (young / "reports" / "fleet.html", young / "reports" / "vehicle-v00.html"):
+    whole = young / "reports" / "fleet.html"
+    assert list((young / "reports").glob("*.html")) == [whole], "the site has a page of every vehicle"
+    assert '<a href="../site/vehicle-v00.html">v00</a>' in whole.read_text()
+    for path in (whole, write_vehicle_report(young, "v00")):
         assert '<span class="badge look">drift or step</span>' in path.read_text()
     page = (young / "site" / "vehicle-v00.html").read_text()
     assert reason in page

@@ -107,8 +107,8 @@ def prepare(
     """
     vectors = {name: constants.get(name) for name in ("accelerometer", "magnetometer")}
     readings = Readings(**{**vars(readings), **{name: None for name, start in vectors.items() if start is None}})
-    q, gyro = _start_attitude(readings, vectors, constants.get("gyroscope"))
     knots = place_knots(readings.t, readings.segment, KNOT_SPACING_S)
+    q, gyro = _start_attitude(readings, knots.index, vectors, constants.get("gyroscope"))
     rate = np.sqrt(np.mean(np.sum((gyro[0] * readings.turning[0] + gyro[1]) ** 2, axis=1)))
     model = Model.of(readings, knots, side=averaging_side(readings, 3.0 * float(rate)))
     values = {
@@ -118,7 +118,7 @@ def prepare(
     for name, start in {**vectors, "gyroscope": gyro}.items():
         if name in model.triads and start is not None:
             values[name] = model.triads[name].scaled(*start)
-    return model, State(q[knots.index], np.zeros((len(knots.index), STATES - 3)), values)
+    return model, State(q, np.zeros((len(knots.index), STATES - 3)), values)
 
 
 def anew(model: Model, state: State) -> State:
@@ -126,14 +126,14 @@ def anew(model: Model, state: State) -> State:
     far off, some attitudes end in a minimum in which a passing field or translation explains the readings."""
     constants = {name: triad.logged(state.values[name]) for name, triad in model.triads.items()}
     vectors = {name: constants.get(name) for name in ("accelerometer", "magnetometer")}
-    q, _ = _start_attitude(model.readings, vectors, constants["gyroscope"])
-    return State(q[model.knots.index], np.zeros_like(state.motion), state.values)
+    q, _ = _start_attitude(model.readings, model.knots.index, vectors, constants["gyroscope"])
+    return State(q, np.zeros_like(state.motion), state.values)
 
 
 def _start_attitude(
-    r: Readings, vectors: Mapping[str, Constants | None], gyro: Constants | None
+    r: Readings, at: np.ndarray, vectors: Mapping[str, Constants | None], gyro: Constants | None
 ) -> tuple[Array, Constants]:
-    """Attitude of the sensor axes (n, 4) and gyroscope constants."""
+    """Attitude of the sensor axes (k, 4) at the samples `at` (k,), and gyroscope constants."""
     sensed = {}
     for name, start in vectors.items():
         logged = r.accelerometer if name == "accelerometer" else r.magnetometer
@@ -151,9 +151,10 @@ def _start_attitude(
     relative = propagate_stretches(r.t, r.gyroscope * gyro[0] + gyro[1], r.segment)
     r_nb = body_from_inertial(relative).transpose(0, 2, 1)
     carried = {name: np.einsum("nij,nj->ni", r_nb, x) for name, x in sensed.items()}
-    offsets = [_turned_to(r, _means(r, carried, *window)) for window in WINDOWS]
-    wander = [_wander(r.t, offset, side_s) for offset, (_, side_s) in zip(offsets, WINDOWS, strict=True)]
-    return multiply(offsets[int(np.argmin(wander))], relative), gyro
+    means = ({name: x[at] for name, x in _means(r, carried, *window).items()} for window in WINDOWS)
+    offsets = [_turned_to(r, own) for own in means]
+    wander = [_wander(r.t[at], offset, side_s) for offset, (_, side_s) in zip(offsets, WINDOWS, strict=True)]
+    return multiply(offsets[int(np.argmin(wander))], relative[at]), gyro
 
 
 def _means(r: Readings, carried: Mapping[str, Array], cutoff_hz: float, side_s: float) -> dict[str, Array]:
