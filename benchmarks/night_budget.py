@@ -4,8 +4,8 @@
 
 Simulated flights of 40 s at 185 Hz, with a VPS or without, through all steps in this process, without Prefect, then
 the night's own work on them: planning it when everything is new and when nothing is, publishing, closing. Seconds of
-the processor a flight, the share of all, and the ratio to `night_budget.json`, which `--keep` writes anew: machines
-differ, ratios of one machine's runs mean something.
+the processor a flight, the share of all, and the ratio to `night_budget.json`, which `--keep` writes anew. Machines
+differ, and one does from hour to hour: a ratio is of both in units of what a plain loop takes on the machine.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import json
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,8 @@ from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse.stage_store import StageStore
 
 KEPT = Path(__file__).with_suffix(".json")
+LOOP = "a plain loop (not in a night)"
+ROUNDS = 5_000_000
 
 
 class Budget:
@@ -79,6 +81,7 @@ def main() -> None:
     for name in ("save", "load", "complete", "latest"):
         budget.watch(StageStore, name, lambda *_, **__: "cache of stages")
     with one_thread(), tempfile.TemporaryDirectory() as folder:
+        _loop(budget)
         archive, root = Path(folder) / "archive", Path(folder) / "data"
         with budget.on("simulate (not in a night)"):
             flown = Experiment(seed=1, dip_rad=np.radians(60.0), translation_rms_mps2=0.1, vps=not given.no_vps)
@@ -97,20 +100,36 @@ def main() -> None:
         with budget.on("plan, nothing new"):
             again = plan_night(archive, root)
         assert len(again.plan.done) == given.flights
+        _loop(budget)
         logs = sum(path.stat().st_size for path in archive.rglob("*.mcap"))
         kept = sum(path.stat().st_size for path in root.rglob("*") if path.is_file())
-    before: dict[str, float] = json.loads(KEPT.read_text()) if KEPT.exists() else {}
-    each = {what: spent / given.flights for what, spent in budget.spent.items()}
-    total = sum(spent for what, spent in each.items() if "not in" not in what)
+    kind = "without a VPS" if given.no_vps else "with a VPS"
+    every: dict[str, dict[str, float]] = json.loads(KEPT.read_text()) if KEPT.exists() else {}
+    each, before = {what: spent / given.flights for what, spent in budget.spent.items()}, every.get(kind, {})
+    slower = each[LOOP] * given.flights / before[LOOP] if before else 1.0
     print(f"{'ms a flight':>12} {'share':>6} {'÷ before':>9}")
     for what, spent in sorted(each.items(), key=lambda item: -item[1]):
-        ratio = f"{spent / before[what]:9.2f}" if before.get(what) else " " * 9
-        print(f"{1e3 * spent:12.2f} {100 * spent / total:5.1f}% {ratio}  {what}")
-    ratio = total / sum(spent for what, spent in before.items() if "not in" not in what) if before else 1.0
-    print(f"{1e3 * total:12.2f}        {ratio:9.2f}  all of a night but Prefect and the start of its processes")
+        if what != LOOP:
+            ratio = f"{spent / before[what] / slower:9.2f}" if before.get(what) else " " * 9
+            print(f"{1e3 * spent:12.2f} {100 * spent / _whole(each):5.1f}% {ratio}  {what}")
+    ratio = f"{_whole(each) / _whole(before) / slower:9.2f}" if before else " " * 9
+    print(f"{1e3 * _whole(each):12.2f}        {ratio}  all of a night but Prefect and the start of its processes")
     print(f"warehouse {kept / given.flights / 1e6:.2f} MB a flight, {100 * kept / logs:.0f} % of its log")
     if given.keep:
-        KEPT.write_text(json.dumps({what: round(spent, 6) for what, spent in each.items()}, indent=1) + "\n")
+        every[kind] = {what: round(spent, 6) for what, spent in each.items()} | {LOOP: each[LOOP] * given.flights}
+        KEPT.write_text(json.dumps(every, indent=1) + "\n")
+
+
+def _loop(budget: Budget) -> None:
+    """How fast the machine is just now."""
+    with budget.on(LOOP):
+        total = 0
+        for i in range(ROUNDS):
+            total += i
+
+
+def _whole(each: Mapping[str, float]) -> float:
+    return sum(spent for what, spent in each.items() if "not in" not in what)
 
 
 if __name__ == "__main__":
