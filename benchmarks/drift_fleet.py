@@ -28,12 +28,12 @@ import polars as pl
 from scipy.linalg import block_diag
 
 from fieldcal.names import SENSORS, Sensor
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.simulation.archive import write_flight
 from fieldcal.simulation.experiment import BIAS, MID_SCALE, SCALE, Experiment, simulate
 from fieldcal.trends.drift_table import table_of, update_drift
 from fieldcal.trends.pooled.table import table_of as pooled_of
 from fieldcal.warehouse import Warehouse
-from fieldcal.warehouse.store import empty_frame
 
 UNITS, SESSIONS = 12, 24
 START = dt.datetime(2026, 1, 12, 8, 0, tzinfo=dt.UTC)

@@ -36,6 +36,7 @@ from fieldcal.estimation.pooled.movement import strengths
 from fieldcal.estimation.pooled.unit import Flight, Unit
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import SENSORS, Sensor
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.simulation.archive import settings, signals
 from fieldcal.simulation.experiment import Experiment, simulate
 from fieldcal.simulation.ordinary import ordinary_flight
@@ -44,7 +45,6 @@ from fieldcal.stages.joint.information import table_of as rows_of_equations
 from fieldcal.stages.pipeline import run_flight
 from fieldcal.trends.pooled.memory import Memory
 from fieldcal.trends.pooled.table import table_of
-from fieldcal.warehouse.store import empty_frame
 
 START = dt.datetime(2026, 1, 12, 8, 0, tzinfo=dt.UTC)
 UNITS = {"gyroscope": "rad/s", "accelerometer": "m/s^2", "magnetometer": "norm"}

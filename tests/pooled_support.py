@@ -12,11 +12,11 @@ from pooled import NAMES, SCATTER, UNITS, Truth, led
 from fieldcal.estimation.normal_equations import Name, NormalEquations
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Method, Sensor
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.stages.joint.information import table_of as rows_of_equations
 from fieldcal.stages.results import triad_rows
 from fieldcal.stages.tables import calibration_rows
 from fieldcal.warehouse.publish import publish
-from fieldcal.warehouse.store import empty_frame
 
 
 def flight(rng: np.random.Generator, at: Array, seen: int, unseen: Name | None = None) -> NormalEquations:

@@ -17,13 +17,14 @@ from fieldcal import schemas
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import FLEET_TABLES, FLIGHT_TABLES, HISTORY_TABLES, SchemaMismatch
 from fieldcal.schemas.columns import SEQUENCE, STARTED_AT
+from fieldcal.schemas.frames import empty_frame, frame
 from fieldcal.warehouse import checksums
 from fieldcal.warehouse.decisions.withdrawn import DECIDED, as_decided, decisions
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import history_path
 from fieldcal.warehouse.remote.turn import in_turn
-from fieldcal.warehouse.store import conform, empty_frame, frame, read_arrow, read_table, table_bytes
+from fieldcal.warehouse.store import conform, read_arrow, read_table, table_bytes
 
 _ORDER = (*(name for name in FLIGHT_TABLES if name != "flight"), *FLEET_TABLES, "flight")
 

@@ -11,12 +11,13 @@ import polars as pl
 
 from fieldcal.remote.url import is_url
 from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES, signal_kind
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.schemas.migrations import fillings
 from fieldcal.warehouse.checksums import assure
 from fieldcal.warehouse.layout import encode_id, history_files, history_path, signal_files, signal_path, vehicle_name
 from fieldcal.warehouse.remote.signals import fetch_signals
 from fieldcal.warehouse.signals import signal_ids
-from fieldcal.warehouse.store import by_absent_columns, empty_frame
+from fieldcal.warehouse.store import by_absent_columns
 from fieldcal.warehouse.views import AT, VIEWS
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from fieldcal.names import Json
-from fieldcal.warehouse.store import empty_frame
+from fieldcal.schemas.frames import empty_frame
 
 
 def as_json(rows: pl.DataFrame) -> dict[str, Sequence[Json]]:

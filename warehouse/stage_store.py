@@ -19,12 +19,13 @@ import polars as pl
 from fieldcal.names import Json
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import fits
+from fieldcal.schemas.frames import frame
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.layout import prepare, stage_folder
 from fieldcal.warehouse.rows_as_json import as_json, digest, from_json
 from fieldcal.warehouse.sealed import BrokenSeal, seal, unseal
-from fieldcal.warehouse.store import conform, frame, read_arrow, write_table
+from fieldcal.warehouse.store import conform, read_arrow, write_table
 
 RECORD = "run.json"
 

@@ -24,6 +24,7 @@ from fieldcal import schemas
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import SchemaMismatch
 from fieldcal.schemas.arrow import VERSION_KEY
+from fieldcal.schemas.frames import frame
 from fieldcal.schemas.migrations import fillings, name_today
 from fieldcal.warehouse.errors import WarehouseError, disk
 from fieldcal.warehouse.files import AroundRename, AtomicFile, write_bytes
@@ -268,20 +269,6 @@ def read_facts(path: Path) -> dict[str, str]:
     with disk(path, "read"), path.open("rb") as file:
         metadata = pq.read_schema(file).metadata or {}
     return {key.decode(): value.decode() for key, value in metadata.items()}
-
-
-def empty_frame(table: str, *, stage: bool = False) -> pl.DataFrame:
-    """A table without rows, its columns typed."""
-    # `Schema.empty_table` would load pandas where it is installed: a third of a second at every start.
-    return frame(pa.Table.from_batches([], schemas.arrow_schema(table, stage=stage)))
-
-
-def frame(rows: pa.Table) -> pl.DataFrame:
-    """An Arrow table as a polars frame; metadata, which polars has no place for, is left behind."""
-    result = pl.from_arrow(pa.Table.from_arrays(rows.columns, names=rows.column_names))
-    if not isinstance(result, pl.DataFrame):
-        raise TypeError("a table is needed, not a column")
-    return result
 
 
 def conform(data: Data, table: str, *, stage: bool = False) -> pa.Table:

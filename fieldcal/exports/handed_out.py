@@ -18,12 +18,12 @@ import polars as pl
 from fieldcal.exports import AUTOPILOTS
 from fieldcal.exports.calibration import Constants, Export
 from fieldcal.schemas.columns import FLOWN_ORDER
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.schemas.reference import SAME_VALUE
 from fieldcal.schemas.rows import ExportRow
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.publish import append
 from fieldcal.warehouse.questions import existing
-from fieldcal.warehouse.store import empty_frame
 
 
 class Fate(StrEnum):

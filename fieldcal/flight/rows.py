@@ -18,12 +18,12 @@ from fieldcal.logs.facts import Facts, FindingFacts
 from fieldcal.logs.on_board import PRIMARY
 from fieldcal.names import Json, Sensor, Status, Verdict
 from fieldcal.reason_codes import ReasonCode
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.schemas.rows import FlightLead, FlightRow, RunRow, UnitLead
 from fieldcal.stages.composition import PUBLISHED_ROWS
 from fieldcal.stages.pipeline import PUBLISHED
 from fieldcal.stages.preparation import TURNED_DEG
 from fieldcal.stages.stage import stage_and_unit
-from fieldcal.warehouse.store import empty_frame
 from fieldcal.words.flights import is_consequence, no_result
 
 COMPOSITION, MANOEUVRE = "composition", "manoeuvre"

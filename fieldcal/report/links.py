@@ -27,7 +27,7 @@ def flight_name(flight_id: str) -> str:
 @dataclass(frozen=True)
 class Links:
     """Links from a report in `folder`; `expected` names files that will be written there too, `fleet` the fleet's, and
-    `on_site` pages of the site beside the folder, for what has no report."""
+    `on_site` pages of the site beside the folder: they are of now, a report that lies there may be of long ago."""
 
     folder: Path
     expected: frozenset[str] = frozenset()
@@ -36,9 +36,9 @@ class Links:
 
     def to(self, name: str, text: str) -> str | Markup:
         """`text` as a link to the report `name`, or the plain text where there is none."""
-        if self._there(name):
-            return link(quote(name), text)
-        return link(f"../{SITE}/{quote(name)}", text) if name in self.on_site else text
+        if name in self.on_site - self.expected:
+            return link(f"../{SITE}/{quote(name)}", text)
+        return link(quote(name), text) if self._there(name) else text
 
     def up(self) -> tuple[str, str] | None:
         """The fleet page, as a page's `up`."""

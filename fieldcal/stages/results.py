@@ -64,7 +64,7 @@ def fault_rows(faults: Sequence[Fault]) -> pl.DataFrame:
 
 def fatal_fault(faults: pl.DataFrame, sensors: tuple[str, ...]) -> FaultRow | None:
     """The first fatal row of `faults` that concerns one of `sensors`, or None."""
-    if not faults["fatal"].any():  # of most flights: a filter asks a hundred times as long
+    if not faults["fatal"].any():  # so of most flights, and a filter takes far longer
         return None
     found = faults.filter(pl.col("fatal") & pl.col("sensor").is_in(list(sensors)))
     return cast(FaultRow, found.row(0, named=True)) if found.height else None

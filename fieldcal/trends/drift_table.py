@@ -14,6 +14,7 @@ from fieldcal.estimation.segments import run_starts
 from fieldcal.names import GRAVEST_FIRST
 from fieldcal.provenance.run_key import run_key, source_digest
 from fieldcal.schemas import FLIGHT_TABLES, TABLES
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.schemas.reference import ENOUGH_SESSIONS
 from fieldcal.schemas.rows import DriftRow
 from fieldcal.trends import few_sessions, regression, siblings, temperatures
@@ -33,7 +34,6 @@ from fieldcal.trends.warm_up_slopes import slopes_of_warm_ups
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.layout import history_files
 from fieldcal.warehouse.questions import existing, those_asked_for
-from fieldcal.warehouse.store import empty_frame
 
 ALIKE = ("sensor", "method", "parameter", "unit")
 SIBLINGS = (*ALIKE, "axis")

@@ -12,9 +12,9 @@ import polars as pl
 import pytest
 
 import fieldcal
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.trends.drift_table import update_drift
 from fieldcal.warehouse.publish import publish
-from fieldcal.warehouse.store import empty_frame
 
 matplotlib.use("agg")
 SESSIONS = 4

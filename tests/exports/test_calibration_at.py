@@ -21,11 +21,11 @@ from fieldcal.exports.calibration_at import constants_of
 from fieldcal.geometry.frames import FRD_FROM_FLU
 from fieldcal.logs import ingest, log_sha256
 from fieldcal.logs.mcap.write import imu_channel, write_mcap
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.stages.tables import matrix, triad
 from fieldcal.warehouse.publish import publish
-from fieldcal.warehouse.store import empty_frame
 
 EQUAL = 1e-9
 ROUNDING = 1e-12

@@ -135,6 +135,8 @@ def test_a_young_fleet_is_told_what_so_few_sessions_tell_in_every_place_alike(
     assert '<a href="../site/vehicle-v00.html">v00</a>' in whole.read_text()
     for path in (whole, write_vehicle_report(young, "v00")):
         assert '<span class="badge look">drift or step</span>' in path.read_text()
+    close_night(young, FAR)
+    assert '<a href="../site/vehicle-v00.html">v00</a>' in whole.read_text(), "not to a report that may be old"
     page = (young / "site" / "vehicle-v00.html").read_text()
     assert reason in page
     assert reason in (young / "site" / "index.html").read_text()

@@ -6,7 +6,8 @@ import polars as pl
 import pytest
 
 from fieldcal.schemas import STAGE_TABLES, fits
-from fieldcal.warehouse.store import conform, empty_frame, frame
+from fieldcal.schemas.frames import empty_frame, frame
+from fieldcal.warehouse.store import conform
 
 NOTES = pl.DataFrame(
     {"row": [0, 1], "column": [0, 1], "value": [1.0, None]},

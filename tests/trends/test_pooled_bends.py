@@ -16,6 +16,7 @@ from pooled_support import publish_unit
 import fieldcal
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Sensor
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.trends.drift_table import update_drift
 from fieldcal.trends.pooled.table import near, strengths_told
 from fieldcal.trends.pooled.units import by_unit, unit_of
@@ -23,7 +24,6 @@ from fieldcal.trends.pooled.verdicts import CURVE, read
 from fieldcal.trends.regression import Trends
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.publish import publish
-from fieldcal.warehouse.store import empty_frame
 
 VEHICLES, SESSIONS = 4, 14
 ZERO = ("gyroscope", "zero", "x")

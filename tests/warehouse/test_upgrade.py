@@ -28,13 +28,13 @@ from fieldcal.provenance.run_key import code_digest
 from fieldcal.report.fitness import Criteria
 from fieldcal.schemas import HISTORY_TABLES, SIGNAL_TABLES, TABLES, migrations
 from fieldcal.schemas.arrow import VERSION_KEY
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.schemas.migrations import CHANGES, Change, fillings
 from fieldcal.simulation.archive import write_flights
 from fieldcal.simulation.experiment import Experiment
 from fieldcal.warehouse import Warehouse, WarehouseError
 from fieldcal.warehouse.layout import history_files, history_path, vehicle_of
 from fieldcal.warehouse.publish import publish, read_history
-from fieldcal.warehouse.store import empty_frame
 from fieldcal.warehouse.upkeep.upgrade import upgrade
 from fieldcal.warehouse.upkeep.verify import verify
 

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fieldcal.schemas import SchemaMismatch
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.warehouse import store
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.files import AtomicFile, file_sha256, remove_abandoned, write_bytes
@@ -58,8 +59,8 @@ def test_batches_and_one_piece_give_the_same_bytes(tmp_path: Path) -> None:
 def test_no_rows_are_a_table_too(tmp_path: Path) -> None:
     for table in ("vps", "calibration"):
         path = tmp_path / f"{table}.parquet"
-        store.write_table(store.empty_frame(table), table, path)
-        assert store.read_table(path, table).equals(store.empty_frame(table))
+        store.write_table(empty_frame(table), table, path)
+        assert store.read_table(path, table).equals(empty_frame(table))
 
 
 def test_widths_are_converted_losses_refused(tmp_path: Path) -> None:
@@ -228,7 +229,7 @@ def test_files_and_folders_are_forced_to_disk_before_they_count(
 def test_a_small_table_is_read_without_threads(tmp_path: Path) -> None:
     """Some processes that ended just after such a read were aborted: exit code 134 behind a good answer."""
     path = tmp_path / "part.parquet"
-    store.write_table(store.empty_frame("flight"), "flight", path)
+    store.write_table(empty_frame("flight"), "flight", path)
     program = """
 import os, sys
 from pathlib import Path

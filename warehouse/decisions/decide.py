@@ -13,12 +13,12 @@ from fieldcal.errors import FieldcalError
 from fieldcal.names import Decision
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas.columns import FLOWN_ORDER
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.schemas.rows import DecisionRow
 from fieldcal.warehouse.decisions.withdrawn import PARTS
 from fieldcal.warehouse.publish import append, settle
 from fieldcal.warehouse.query import Warehouse
 from fieldcal.warehouse.questions import existing, nearest
-from fieldcal.warehouse.store import empty_frame
 
 LEAST_PREFIX = 6
 """Characters of a flight's id by which it may be called, where no other begins so."""

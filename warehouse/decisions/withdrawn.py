@@ -8,9 +8,10 @@ import numpy as np
 import polars as pl
 
 from fieldcal.names import Decision, Status
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.warehouse import checksums
 from fieldcal.warehouse.layout import history_files
-from fieldcal.warehouse.store import empty_frame, read_table
+from fieldcal.warehouse.store import read_table
 
 DECIDED = ("calibration", "sync", "information")
 """Tables of flights whose rows have a status that says whether they count."""

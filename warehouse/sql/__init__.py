@@ -25,11 +25,12 @@ import pyarrow as pa
 from fieldcal import schemas
 from fieldcal.reason_codes import ReasonCode
 from fieldcal.schemas import HISTORY_TABLES
+from fieldcal.schemas.frames import frame
 from fieldcal.schemas.migrations import fillings
 from fieldcal.warehouse.checksums import assure
 from fieldcal.warehouse.errors import WarehouseError
 from fieldcal.warehouse.layout import history_files, vehicle_of
-from fieldcal.warehouse.store import by_absent_columns, frame
+from fieldcal.warehouse.store import by_absent_columns
 from fieldcal.warehouse.views import VIEWS, view_text
 
 _ABOUT_ALL = ("show", "describe", "summarize", "information_schema", "duckdb_", "pg_", "pragma_")

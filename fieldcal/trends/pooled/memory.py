@@ -18,9 +18,9 @@ from polars.exceptions import PolarsError
 
 from fieldcal.estimation.pooled.strengths import Strengths
 from fieldcal.estimation.pooled.unit import Kinds
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.warehouse.files import write_bytes
 from fieldcal.warehouse.sealed import seal_bytes, unseal_bytes
-from fieldcal.warehouse.store import empty_frame
 
 PLACE = Path("night") / "pooled.bin"
 OF = "of"

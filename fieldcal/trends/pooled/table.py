@@ -19,6 +19,7 @@ from fieldcal.geometry.rotation import Array
 from fieldcal.names import Status
 from fieldcal.provenance.run_key import run_key, source_digest
 from fieldcal.schemas import TABLES, table_key
+from fieldcal.schemas.frames import empty_frame
 from fieldcal.trends.fleet.groups import groups
 from fieldcal.trends.fleet.publishing import publish_where_other
 from fieldcal.trends.one_sensor import Exchanges, told
@@ -28,7 +29,6 @@ from fieldcal.trends.pooled.rows import rows_of_unit, strengths_told
 from fieldcal.trends.pooled.units import DAY, EPOCH, HistoryUnit, by_unit, first_that_tell, unit_of, units_that_tell
 from fieldcal.warehouse import Warehouse
 from fieldcal.warehouse.decisions.withdrawn import counting
-from fieldcal.warehouse.store import empty_frame
 
 KEY = list(table_key("pooled"))
 MOST_UNITS = 40
