@@ -443,7 +443,7 @@ def main() -> None:
     parser.add_argument("--without", action="store_true", help="the receiver's velocity is not used")
     parser.add_argument("--seconds", type=float, default=60.0, help="that an ordinary flight lasts")
     parser.add_argument("--units", type=int, default=500)
-    parser.add_argument("--fleets", type=int, default=100)
+    parser.add_argument("--fleets", type=int)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--piece", type=float, default=20.0)
@@ -460,9 +460,9 @@ def main() -> None:
     elif given.what == "together":
         together(given.rounds)
     elif given.what == "claims":
-        claims(min(given.fleets, 4))
+        claims(given.fleets or 4)
     elif given.what == "alarms":
-        alarms(given.fleets)
+        alarms(given.fleets or 100)
     elif given.what == "cost":
         cost(given.units, given.flights)
     else:

@@ -34,18 +34,21 @@ def theil(measured: ArrayLike, model: ArrayLike) -> Fit:
     z, y = np.asarray(measured, dtype=float), np.asarray(model, dtype=float)
     if z.shape != y.shape or z.ndim != 2 or len(z) == 0:
         raise ValueError(f"measured and model must be the same (n, m) with n ≥ 1, got {z.shape} and {y.shape}")
-    mean_square = float(np.mean((z - y) ** 2))
+    # Channels by rows: sums over one run through memory.
+    z, y = np.ascontiguousarray(z.T), np.ascontiguousarray(y.T)
+    error = z - y
+    mean_square = float(np.mean(error * error))
     scale = float(np.sqrt(np.mean(y * y)) + np.sqrt(np.mean(z * z)))
-    bias = (z.mean(axis=0) - y.mean(axis=0)) ** 2
-    sz, sy = z.std(axis=0), y.std(axis=0)
+    mean_z, mean_y = z.mean(axis=1, keepdims=True), y.mean(axis=1, keepdims=True)
+    bias = (mean_z - mean_y) ** 2
+    from_z, from_y = z - mean_z, y - mean_y
+    sz, sy = np.sqrt(np.mean(from_z * from_z, axis=1)), np.sqrt(np.mean(from_y * from_y, axis=1))
     variance = (sz - sy) ** 2
-    cross = np.mean((z - z.mean(axis=0)) * (y - y.mean(axis=0)), axis=0)
-    covariance = 2 * (sz * sy - cross)
-    total = mean_square * z.shape[1]
+    covariance = 2 * (sz * sy - np.mean(from_z * from_y, axis=1))
+    total = mean_square * len(z)
     share = [float(np.sum(v)) / total if total > 0 else float("nan") for v in (bias, variance, covariance)]
     tic = float(np.sqrt(mean_square)) / scale if scale > 0 else 0.0
-    rms = float(np.sqrt(np.mean(np.sum((z - y) ** 2, axis=1))))
-    return Fit(tic, share[0], share[1], share[2], rms, len(z))
+    return Fit(tic, share[0], share[1], share[2], float(np.sqrt(total)), z.shape[1])
 
 
 def theil_attitude(measured: ArrayLike, model: ArrayLike) -> Fit:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fieldcal import compiled
+from fieldcal.compiled import between
 from fieldcal.geometry.intervals import interval_of, share_of_interval
 
 Array = NDArray[np.floating]  # of any width, because numpy.linalg's answers are so to the type check
@@ -197,6 +199,8 @@ def hermite(t: ArrayLike, q: ArrayLike, rate: ArrayLike, at: ArrayLike) -> Array
     Between samples T apart SLERP cuts a swing of ω rad/s short by (ωT)²/12: 0.3 % at 3 Hz and 10 ms. Samples without a
     rate (NaN) fall back on it."""
     t, q, rate, at = (np.asarray(x, dtype=float) for x in (t, q, rate, at))
+    if compiled.LIBRARY is not None and len(t) > 1:
+        return between.hermite(compiled.LIBRARY, t, q, rate, at)
     i = interval_of(t, at)
     step = t[i + 1] - t[i]
     u = share_of_interval(t, i, at)[:, None]
@@ -212,6 +216,8 @@ def slerp(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:
 
     Times outside t take the nearest end; mask them. Does not look for gaps: mask those too."""
     t, q, at = np.asarray(t, dtype=float), np.asarray(q, dtype=float), np.asarray(at, dtype=float)
+    if compiled.LIBRARY is not None and len(t) > 1:
+        return between.slerp(compiled.LIBRARY, t, q, at)
     i = interval_of(t, at)
     step = to_rotation_vector(multiply(conjugate(q[i]), q[i + 1]))
     return continuous(multiply(q[i], from_rotation_vector(share_of_interval(t, i, at)[:, None] * step)))

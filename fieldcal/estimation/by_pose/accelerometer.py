@@ -5,7 +5,10 @@ Both sides pass the same low-pass, so that no part of the motion stands on one s
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -89,11 +92,12 @@ def fit_accelerometer(
         x = (x - centre) / spread
         fastest = 1.0 / (LEAST_SAMPLES_A_PERIOD * float(np.median(np.diff(at))))
         cutoffs = sorted({min(f, fastest) for f in CUTOFFS_HZ}, reverse=True)
+        products = cache(partial(_products, times, x, valid, turn, at, path))
         fits = []
         for cutoff_hz in cutoffs:
             # Slower motion is known across longer gaps.
             gap_s = max(max_gap_s, BRIDGED_PERIODS / cutoff_hz)
-            rows = _rows(times, segment, x, valid, turn, at, path, gravity_mps2, gap_s, cutoff_hz)
+            rows = _rows(products, segment, at, gravity_mps2, gap_s, cutoff_hz)
             if sum(len(y) for _, y in rows) >= FEWEST_ROWS:
                 columns, y = (np.concatenate(parts) for parts in zip(*rows, strict=True))
                 fits.append(_solved(columns, y, abs(gravity_mps2)))
@@ -119,14 +123,51 @@ def _best(fits: list[TriadByPose], centre: Array, spread: float) -> TriadByPose:
     return replace(fit, matrix=logged[:9].reshape(3, 3), bias=logged[9:], covariance=covariance)
 
 
+Stretch = tuple[tuple[int, int], tuple[int, int]]
+"""Without a gap: readings [a, b) and positions [c, d)."""
+
+
+@dataclass(frozen=True)
+class _Products:
+    """What the unknowns are linear in, not yet low-passed, of a stretch: `every` (n, 3 · 22), each world axis by matrix
+    (9), the readings' slope by matrix (9), bias (3) and position (1), every `interval_s`."""
+
+    every: Array
+    interval_s: float
+
+
+def _products(
+    t: Array, x: Array, valid: np.ndarray, q: Array, t_vps: Array, position: Array, stretch: Stretch
+) -> _Products | None:
+    """The same for every cut-off; None of a stretch that is too short."""
+    (a, b), (c, d) = stretch
+    inside = np.arange(a, b)[(t[a:b] >= t_vps[c]) & (t[a:b] <= t_vps[d - 1]) & valid[a:b]]
+    if len(inside) < 20 or t[inside[-1]] - t[inside[0]] < SHORTEST_S:
+        return None
+    index, own_interval_s = lattice(t[inside])
+    thinning = max(1, int(1.0 / (THINNED_HZ * own_interval_s)))
+    interval_s = thinning * own_interval_s
+    both = np.concatenate(
+        [fill(index, x[inside]), body_from_inertial(normalise(fill(index, q[inside]))).reshape(-1, 9)], axis=1
+    )
+    if thinning > 1:
+        both = low_pass(both, MOTION_HZ, own_interval_s, side_s=THINNING_SIDE_S)[::thinning]
+    at = t[inside[0]] + interval_s * np.arange(len(both))
+    reading, turn = both[:, :3], both[:, 3:].reshape(-1, 3, 3).transpose(0, 2, 1)
+    slope = differentiate_samples(at, reading)
+    path = CubicSpline(t_vps[c:d], position[c:d])(at)
+    n = len(at)
+    every = np.concatenate(
+        [np.einsum("nij,nk->nijk", turn, v).reshape(n, 3, 9) for v in (reading, slope)] + [turn, path[..., None]],
+        axis=2,
+    ).reshape(n, -1)
+    return _Products(every, interval_s)
+
+
 def _rows(
-    t: Array,
+    products: Callable[[Stretch], _Products | None],
     segment: np.ndarray,
-    x: Array,
-    valid: np.ndarray,
-    q: Array,
     t_vps: Array,
-    position: Array,
     gravity_mps2: float,
     max_gap_s: float,
     cutoff_hz: float,
@@ -137,39 +178,20 @@ def _rows(
     Columns: matrix (9), bias (3), the readings' slope for the delay, by matrix element (9), lever arm (3), tilt (2)."""
     sign, g = float(np.sign(gravity_mps2)), abs(gravity_mps2)
     out = []
-    for a, b in run_bounds(segment):
-        for c, d in contiguous(t_vps, max_gap_s):
-            inside = np.arange(a, b)[(t[a:b] >= t_vps[c]) & (t[a:b] <= t_vps[d - 1]) & valid[a:b]]
-            if len(inside) < 20 or t[inside[-1]] - t[inside[0]] < SHORTEST_S:
-                continue
-            index, own_interval_s = lattice(t[inside])
-            thinning = max(1, int(1.0 / (THINNED_HZ * own_interval_s)))
-            interval_s = thinning * own_interval_s
-            both = np.concatenate(
-                [fill(index, x[inside]), body_from_inertial(normalise(fill(index, q[inside]))).reshape(-1, 9)], axis=1
-            )
-            if thinning > 1:
-                both = low_pass(both, MOTION_HZ, own_interval_s, side_s=THINNING_SIDE_S)[::thinning]
-            at = t[inside[0]] + interval_s * np.arange(len(both))
-            reading, turn = both[:, :3], both[:, 3:].reshape(-1, 3, 3).transpose(0, 2, 1)
-            slope = differentiate_samples(at, reading)
-            path = CubicSpline(t_vps[c:d], position[c:d])(at)
-            n = len(at)
-            every = np.concatenate(
-                [np.einsum("nij,nk->nijk", turn, v).reshape(n, 3, 9) for v in (reading, slope)]
-                + [turn, path[..., None]],
-                axis=2,
-            ).reshape(n, -1)
-            side_s = SIDE_PERIODS / cutoff_hz
-            smooth = low_pass(every, cutoff_hz, interval_s, side_s=side_s).reshape(n, 3, -1)
-            by_matrix, late, turn, path = np.split(smooth, [9, 18, 21], axis=2)
-            tilt = np.broadcast_to(-g * np.eye(3)[:, :2], (n, 3, 2))
-            arm = _second_derivative(turn, interval_s)
-            columns = np.concatenate([sign * by_matrix, sign * turn, sign * late, arm, tilt], axis=2)
-            y = np.array([0.0, 0.0, g]) - _second_derivative(path, interval_s)[..., 0]
-            edge, step = round(side_s / interval_s), max(1, round(1.0 / ROWS_A_PERIOD / cutoff_hz / interval_s))
-            rows = slice(edge, n - edge, step)
-            out.append((columns[rows], y[rows]))
+    for of_stretch in map(products, product(run_bounds(segment), contiguous(t_vps, max_gap_s))):
+        if of_stretch is None:
+            continue
+        interval_s, n = of_stretch.interval_s, len(of_stretch.every)
+        side_s = SIDE_PERIODS / cutoff_hz
+        smooth = low_pass(of_stretch.every, cutoff_hz, interval_s, side_s=side_s).reshape(n, 3, -1)
+        by_matrix, late, turn, path = np.split(smooth, [9, 18, 21], axis=2)
+        tilt = np.broadcast_to(-g * np.eye(3)[:, :2], (n, 3, 2))
+        arm = _second_derivative(turn, interval_s)
+        columns = np.concatenate([sign * by_matrix, sign * turn, sign * late, arm, tilt], axis=2)
+        y = np.array([0.0, 0.0, g]) - _second_derivative(path, interval_s)[..., 0]
+        edge, step = round(side_s / interval_s), max(1, round(1.0 / ROWS_A_PERIOD / cutoff_hz / interval_s))
+        rows = slice(edge, n - edge, step)
+        out.append((columns[rows], y[rows]))
     return [stretch for stretch in out if len(stretch[1])]
 
 

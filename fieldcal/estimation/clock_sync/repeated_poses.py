@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fieldcal.estimation.faults import resolution
 from fieldcal.estimation.segments import run_starts
-from fieldcal.geometry.rotation import Array
+from fieldcal.geometry.rotation import Array, normalise
 
 FEWEST_FROZEN, FROZEN_RATIO = 5, 3  # rows alike that are a frozen tracker, and times the usual number
 SPEED_OVER_S = 0.05  # what the vehicle turned just before and after a run of poses alike
@@ -44,14 +44,19 @@ def find_repeats(t: ArrayLike, q: ArrayLike) -> Repeats:
     nothing = np.zeros(n, dtype=bool)
     if n < FEWEST_FROZEN:
         return Repeats(nothing, nothing, nothing, 1)
-    value = np.unique(q, axis=0, return_inverse=True)[1].reshape(n)
+    value = _numbered(q)
     start = run_starts(value)
     length = np.diff(np.r_[start, n])
     usual = int(np.median(length))
-    least = max(LEAST_TURN_RAD, _rounding(q))
-    step = _angle(q[start[:-1]], q[start[1:]])
+    # Angle that is no rounding.
+    rounding = ROUNDING_STEPS * 2.0 * max(resolution(c[np.isfinite(c)]) for c in q.T)
+    least = max(LEAST_TURN_RAD, rounding)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unit = normalise(q)
+    step = _angle(unit[start[:-1]], unit[start[1:]])
     default = _default(value, start, step, least, q)
-    frozen_run = _frozen_runs(t, q, start, length, step, least) & (length >= max(FEWEST_FROZEN, FROZEN_RATIO * usual))
+    frozen_run = _frozen_runs(t, unit, start, length, step, least, rounding)
+    frozen_run &= length >= max(FEWEST_FROZEN, FROZEN_RATIO * usual)
     row = np.repeat(np.arange(len(start)), length)
     in_run = np.arange(n) - start[row]
     frozen = frozen_run[row] & (in_run > 0) & ~default
@@ -59,15 +64,22 @@ def find_repeats(t: ArrayLike, q: ArrayLike) -> Repeats:
     return Repeats(held, frozen, default, usual)
 
 
+def _numbered(q: Array) -> np.ndarray:
+    """A number (n,) for each different row of q (n, 4), from 0; one that is not a number is like no other."""
+    numbers: dict[bytes, int] = {}
+    rows = np.ascontiguousarray(q + 0.0).view(f"V{q.itemsize * q.shape[1]}")[:, 0].tolist()  # −0 is 0
+    value = np.array([numbers.setdefault(row, len(numbers)) for row in rows])
+    return np.where(np.isnan(q).any(axis=1), len(numbers) + np.arange(len(q)), value)
+
+
 def _angle(a: Array, b: Array) -> Array:
-    """Between attitudes (n, 4), rad; 0 where one is no rotation."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        cosine = np.abs(np.sum(a * b, axis=1)) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
+    """Between unit quaternions (n, 4), rad; 0 where one is no rotation."""
+    cosine = np.abs(np.einsum("ij,ij->i", a, b))
     return np.asarray(2.0 * np.arccos(np.clip(np.nan_to_num(cosine, nan=1.0), 0.0, 1.0)))
 
 
 def _frozen_runs(
-    t: Array, q: Array, start: np.ndarray, length: np.ndarray, step: Array, least: float
+    t: Array, q: Array, start: np.ndarray, length: np.ndarray, step: Array, least: float, rounding: float
 ) -> NDArray[np.bool_]:
     """Runs of one pose during which the vehicle turned, by how it turned before and after."""
     n, last = len(t), start + length - 1
@@ -86,16 +98,10 @@ def _frozen_runs(
         for v, d in ((before_radps, t[start] - t[earlier]), (after_radps, t[later] - t[after]))
     ]
     too_fast = np.maximum(*(np.maximum(v, 0.0) for v in slowed)) ** 2 / (2.0 * FASTEST_STOP_RADPS2) > least
-    rounding = _rounding(q)
     short, short_last = np.quantile(step, [SHORT_STEPS, SHORT_LAST_STEPS]) if len(step) else (0.0, 0.0)
     by_steps = np.minimum(into, out) > max(float(short), rounding)
     by_last_step = (last == n - 1) & (into > max(float(short_last), rounding))
     return np.asarray(jumped | too_fast | by_steps | by_last_step)
-
-
-def _rounding(q: Array) -> float:
-    """Angle that is no rounding of attitudes q (n, 4), rad."""
-    return ROUNDING_STEPS * 2.0 * max(resolution(c[np.isfinite(c)]) for c in q.T)
 
 
 def _speed(t: Array, q: Array, a: np.ndarray, b: np.ndarray) -> Array:

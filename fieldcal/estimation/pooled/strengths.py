@@ -25,6 +25,8 @@ LIMITS = 2.0 * np.log(1e-3), 2.0 * np.log(1e3)
 FEW = 4.0
 """Innovations that the expectation of half a session's own sd counts for: little beside many."""
 EXPECTED_SHARE = 0.5
+NEAR, LOOKED_AT = 0.02, 49
+"""Of a logarithm of a variance, so near the likeliest and so many times it is looked at for the mean."""
 RISE = 0.3
 """Of minus twice the logarithm of the likelihood that a strength is still likely at: half a standard deviation."""
 TOLERANCES = {"fatol": 0.01, "xatol": 0.02}
@@ -123,7 +125,8 @@ def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_
 
     Few innovations cannot tell a little from nothing: then the scatter, and what the slope does over the temperatures
     flown, are taken for half of a session's own sd. Nor can they tell a walk or a slope from scatter: what may be
-    either is scatter. Without any two sessions to compare nothing is known to move, but the scatter is that."""
+    either is scatter. A walk is what it is on average of all that it may be (`mean_of_variance`): one of a few per cent
+    of the scatter a √day, which doubles the sd of the mean of twenty sessions, is often likeliest to be none. Without any two sessions to compare nothing is known to move, but the scatter is that."""
     known = np.isfinite(series.value)
     if not known.any():
         return Strengths(0.0, 0.0, 0.0, FEW)
@@ -156,8 +159,8 @@ def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_
     start = min((np.log(np.square(at[:size])) for at in _starts(with_slope)), key=cost)
     simplex = start + np.eye(size + 1, size, -1)
     best = minimize(cost, start, method="Nelder-Mead", options={**TOLERANCES, "initial_simplex": simplex})
-    most = [largest_likely(cost, best.x, best.fun, i) for i in range(size)]
-    found = given(np.array(most))
+    most = [largest_likely(cost, best.x, best.fun, i) for i in range(1, size)]
+    found = given(np.array([mean_of_variance(cost, best.x, best.fun, 0), *most]))
     return replace(found, freedom=FEW + float(np.isfinite(innovations(series, found)[0]).sum()))
 
 
@@ -211,6 +214,16 @@ def unlikely(ratio: float) -> float:
     expected is unlikely, much more hardly, for sessions may be known ever so well."""
     above = np.log(ratio / EXPECTED_SHARE**2)
     return float(above if above > 0.0 else FEW * (above + EXPECTED_SHARE**2 / ratio - 1.0))
+
+
+def mean_of_variance(cost: Callable[[Array], float], best: Array, least: float, i: int) -> float:
+    """Logarithm of the mean of variance i over all that it may be by the likelihood, any sd as likely as another
+    beforehand, the other elements of x as they are."""
+    u = np.linspace(*np.arcsinh((np.array(LIMITS) - best[i]) / NEAR), LOOKED_AT)
+    x = np.repeat(best[None], LOOKED_AT, axis=0)
+    x[:, i] += NEAR * np.sinh(u)
+    likely = np.cosh(u) * np.exp(0.5 * (least - np.array(list(map(cost, x))) + x[:, i]))
+    return float(np.log(likely @ np.exp(x[:, i]) / likely.sum()))
 
 
 def largest_likely(cost: Callable[[Array], float], best: Array, least: float, i: int) -> float:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import warnings
 
+from functools import partial
+
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
@@ -58,10 +60,11 @@ class Swung:
     def rows(self, cutoff_hz: float, **changes: Array) -> list[tuple[Array, Array]]:
         given = {name: changes.get(name, getattr(self, name)) for name in ("logged", "position", "t_vps", "q")}
         valid = np.isfinite(given["logged"]).all(axis=1)
-        return accelerometer._rows(
-            self.t, changes.get("segment", np.zeros(len(self.t), dtype=np.int64)), given["logged"], valid, given["q"],
-            given["t_vps"], given["position"], self.sign * G, 0.05, cutoff_hz,
-        )  # fmt: skip
+        products = partial(
+            accelerometer._products, self.t, given["logged"], valid, given["q"], given["t_vps"], given["position"]
+        )
+        segment = changes.get("segment", np.zeros(len(self.t), dtype=np.int64))
+        return accelerometer._rows(products, segment, given["t_vps"], self.sign * G, 0.05, cutoff_hz)
 
     def fitted(self, **changes: Array) -> TriadByPose:
         given = {name: changes.get(name, getattr(self, name)) for name in ("logged", "q", "position", "t_vps")}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.optimize import brentq, minimize
 from scipy.stats import norm
 
@@ -16,6 +17,7 @@ from fieldcal.estimation.pooled.strengths import (
     beside_scatter,
     innovations,
     largest_likely,
+    mean_of_variance,
     of_pairs,
     strengths_of,
     unlikely,
@@ -124,6 +126,56 @@ def test_the_largest_likely_strength_is_where_the_likelihood_has_fallen_by_half_
     assert largest_likely(lambda x: 0.01 * x[0], best, 0.01, 0) == 1.0
 
 
+@pytest.mark.parametrize("count", [6, 20, 200])
+def test_a_variance_on_average_is_that_of_an_inverse_gamma_distribution(count: int) -> None:
+    """So much normal numbers of one unknown variance, any sd of which was as likely as another, tell of it:
+    their sum of squares over three less than their number; the sum is three times their number."""
+    best = np.array([7.0, np.log(3.0)])
+
+    def cost(x: np.ndarray) -> float:
+        return 50.0 + count * float(x[1] + 3.0 * np.exp(-x[1]))
+
+    found = mean_of_variance(cost, best, cost(best), 1)
+    assert np.exp(found) == pytest.approx(3.0 * count / (count - 3), rel=0.01)
+    np.testing.assert_array_equal(best, [7.0, np.log(3.0)])
+
+
+def last_by_gaussian_process(series: Series, strengths: Strengths) -> tuple[np.ndarray, np.ndarray]:
+    """(value, variance) of each series' constant at its last session, at the reference temperature: kriging with an
+    unknown mean, of sessions whose covariance is that of the walk, the scatter and the slope."""
+    value, variance = np.empty((2, series.value.shape[1]))
+    for j, (day, t, y, own) in enumerate(
+        zip(series.day.T, series.warmth_degc.T, series.value.T, series.variance.T, strict=True)
+    ):
+        walked = day - day[0]
+        k = strengths.walk * np.minimum.outer(walked, walked) + strengths.slope * np.outer(t, t)
+        inverse = np.linalg.inv(k + np.diag(own + strengths.scatter))
+        here, one = strengths.walk * walked, np.ones(len(day))
+        mean = one @ inverse @ y / (one @ inverse @ one)
+        value[j] = mean + here @ inverse @ (y - mean)
+        left = 1.0 - one @ inverse @ here
+        variance[j] = here[-1] - here @ inverse @ here + left**2 / (one @ inverse @ one)
+    return value, variance
+
+
+@pytest.mark.parametrize("walk", [0.0, 0.05, 0.1])
+def test_a_walk_that_sessions_hardly_show_is_in_the_sd(walk: float) -> None:
+    """Of twenty sessions of six constants, whose scatter is 1; a twentieth of it a √day is often likeliest to be none,
+    and the last value is then claimed as well as the mean of all."""
+    off = []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        day, warmth = np.cumsum(rng.uniform(1.0, 10.0, (20, 6)), axis=0), rng.uniform(-20.0, 10.0, (20, 6))
+        steps = walk * np.sqrt(np.diff(day, axis=0)) * rng.normal(size=(19, 6))
+        walked = np.vstack([np.zeros(6), np.cumsum(steps, axis=0)])
+        value = walked + rng.normal(size=(20, 6)) + 0.2 * rng.normal(size=6) * warmth
+        series = Series(day, warmth, value + 0.1 * rng.normal(size=(20, 6)), np.full((20, 6), 0.01))
+        found, variance = last_by_gaussian_process(series, strengths_of(series))
+        off.append((found - walked[-1]) / np.sqrt(variance))
+    assert 0.75 < np.sqrt(np.mean(np.square(off))) < 1.15
+    assert max(np.sqrt(np.mean(np.square(off), axis=1))) < 1.85
+
+
 def test_the_usual_gap_is_the_median_of_days_between_sessions() -> None:
     """Series of four, two and one session; two on the same day are not apart."""
     day = np.array([[0.0, 5.0, 9.0], [2.0, 12.0, np.nan], [2.0, np.nan, np.nan], [6.0, np.nan, np.nan]])
@@ -167,7 +219,8 @@ def moving(seed: int, series: int = 12, sessions: int = 8) -> list[np.ndarray]:
 
 def test_strengths_are_the_largest_that_are_likely_by_all_that_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Innovations, of which one that starts a series anew counts 4.5², what was expected, and pairs of a session;
-    minimised, and left where each has risen by `RISE`, by SciPy from another start."""
+    minimised, and scatter and slope left where each has risen by `RISE`, by SciPy from another start; the walk is the
+    mean of its variance by SciPy's quadrature over its sd."""
     monkeypatch.setattr(module, "TOLERANCES", {"fatol": 1e-7, "xatol": 1e-6})
     series = Series.of(moving(6))
     pairs = np.array([[7.0, 1.0, 0.3], [-9.0, -0.3, 0.5], [12.0, 1.1, 0.4], [11.0, -2.0, 0.2]])
@@ -185,12 +238,20 @@ def test_strengths_are_the_largest_that_are_likely_by_all_that_counts(monkeypatc
         return float(likelihood + expected + of_pairs(pairs, slope, own))
 
     best = minimize(cost, np.full(3, 1.0), method="Powell", options={"xtol": 1e-7, "ftol": 1e-12})
+
+
+    def likely(walk_sd: float) -> float:
+        x = np.r_[2.0 * np.log(walk_sd), best.x[1:]]
+        return float(np.exp(0.5 * (best.fun - cost(x))))
+
+    whole, first = (quad(lambda sd, n=n: sd**n * likely(sd), 1e-3, 20.0, limit=200)[0] for n in (0, 2))
     largest = []
-    for i in range(3):
+    for i in (1, 2):
         way = np.eye(3)[i]
         largest.append(best.x[i] + brentq(lambda by, way=way: cost(best.x + by * way) - best.fun - 0.3, 0.0, 5.0))
     found = strengths_of(series, within=pairs)
-    np.testing.assert_allclose([found.walk, found.scatter, found.slope], unit * np.exp(largest), rtol=2e-3)
+    assert found.walk == pytest.approx(unit[0] * first / whole, rel=2e-3)
+    np.testing.assert_allclose([found.scatter, found.slope], unit[1:] * np.exp(largest), rtol=2e-3)
     assert found.freedom == FEW + 12 * 7 - 1
 
 
