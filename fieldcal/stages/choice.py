@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 LARGEST_DRIFT_RATIO = 1.5
 # Scales against those that the VPS's rates show: so many sd off, and by at least this share, they contradict it.
 CONTRADICTED_SD, CONTRADICTED_SHARE = 5.0, 0.03
-# Low-pass of both sides' rates, Hz and s on either side: a VPS that smooths shows faster turns too small.
-CUTOFF_HZ, SIDE_S = 0.7, 4.0
+# Low-pass of both sides' rates, Hz and s on either side: a VPS that smooths shows faster turns too small. Then it is
+# nothing from f_c + π/side, 1.5 Hz, on: so many rows a second are enough.
+CUTOFF_HZ, SIDE_S, RATE_HZ = 0.7, 4.0, 15.0
 
 
 def choose(tables: Tables, s: ChoiceSettings) -> StageResult:
@@ -151,7 +152,8 @@ def _contradicted(rows: pl.DataFrame, tables: Tables, s: ChoiceSettings) -> dict
     t, at = seconds(samples["t_ns"], origin), seconds(vps["t_ns"], origin)
     near = bridged(t, at)
     interval_s = float(np.median(np.diff(at)))
-    reference = low_pass(matrix(vps, RATE_COLUMNS) @ axes, CUTOFF_HZ, interval_s, side_s=SIDE_S)
+    thinned = np.flatnonzero(near)[:: max(1, int(1.0 / (RATE_HZ * interval_s)))]
+    reference = low_pass(matrix(vps, RATE_COLUMNS) @ axes, CUTOFF_HZ, interval_s, side_s=SIDE_S)[thinned]
     for method in rows.filter(sensor=Sensor.GYROSCOPE)["method"].unique().to_list():
         found = constants(rows, Sensor.GYROSCOPE, Method(method), refused_too=True)
         if found is None or not np.isfinite(found[0]).all():
@@ -162,7 +164,7 @@ def _contradicted(rows: pl.DataFrame, tables: Tables, s: ChoiceSettings) -> dict
         relative = {row["axis"]: (row["sd"] or np.inf) / abs(row["value"]) for row in scale.iter_rows(named=True)}
         out[str(method)] = [
             (off, float(np.hypot(sd, relative.get(axis, np.inf))))
-            for axis, (off, sd) in zip(AXES, _slopes(own[near], reference[near]), strict=True)
+            for axis, (off, sd) in zip(AXES, _slopes(own[thinned], reference), strict=True)
         ]
     return out
 

@@ -73,8 +73,12 @@ def fit_constant_vector(
     centre, spread = x.mean(axis=0), float(max(x.std(axis=0).max(), 1e-300))
     x, slope = (x - centre) / spread, slope / spread
 
+    start = _start(x, turn, length)
+
     def solve(weight: Array) -> tuple[tuple[Array, Array, Array, Array], Array]:
-        found = _minimised(x, turn, slope, weight, length)
+        nonlocal start
+        found = _minimised(x, turn, slope, weight, length, *start)
+        start = found[:2]
         return found, np.linalg.norm(found[2] / axis_sigma(found[2]), axis=1)
 
     (theta, h, residual, sensitivity), weight = reweighted(solve, len(x), rounds=REGRESSION_ROUNDS)
@@ -128,19 +132,25 @@ def _blocks(t: Array, segment: np.ndarray, logged: Array, q: Array, known: np.nd
     return mean(logged[at]), mean(body_from_inertial(q[at])), mean(slope[at])
 
 
-def _minimised(x: Array, turn: Array, slope: Array, weight: Array, length: float) -> tuple[Array, Array, Array, Array]:
-    """Gauss–Newton: θ (15,), field (3,), residuals (m, 3) and their sensitivities (m, 3, 15)."""
-    root = np.sqrt(weight)[:, None]
-    # Start: every component is linear in the nine elements of the attitude; the field is what their coefficients share.
-    regressor = np.column_stack([turn.reshape(len(turn), 9), np.ones(len(turn))]) * root
-    coefficients = np.linalg.lstsq(regressor, x * root, rcond=1e-6)[0]
+def _start(x: Array, turn: Array, length: float) -> tuple[Array, Array]:
+    """θ (15,), its delay 0, and field (3,), by linear regressions."""
+    # Every component is linear in the nine elements of the attitude; the field is what their coefficients share.
+    regressor = np.column_stack([turn.reshape(len(turn), 9), np.ones(len(turn))])
+    coefficients = np.linalg.lstsq(regressor, x, rcond=1e-6)[0]
     shared = np.linalg.svd(coefficients[:9].T.reshape(9, 3))[2][0]
     h = length * shared / np.linalg.norm(shared)
     # Given the field B and z are linear.
     theta = np.zeros(PARAMETERS)
-    linear = np.column_stack([turn @ h, np.ones(len(turn))]) * root
-    solved = np.linalg.lstsq(linear, x * root, rcond=1e-9)[0]
+    solved = np.linalg.lstsq(np.column_stack([turn @ h, np.ones(len(turn))]), x, rcond=1e-9)[0]
     theta[:9], theta[9:12] = solved[:3].T.ravel(), solved[3]
+    return theta, h
+
+
+def _minimised(
+    x: Array, turn: Array, slope: Array, weight: Array, length: float, theta: Array, h: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Gauss–Newton from θ (15,) and field (3,): both, residuals (m, 3) and their sensitivities (m, 3, 15)."""
+    root, theta = np.sqrt(weight)[:, None], theta.copy()
     eye = np.eye(3)
     cost = np.inf
     for _ in range(MAX_ITERATIONS):

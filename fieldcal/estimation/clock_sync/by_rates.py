@@ -33,7 +33,9 @@ from fieldcal.geometry.rotation import (
 )
 from fieldcal.reason_codes import ReasonCode
 
-FINE_CUTOFF_HZ, FINE_SIDE_S = 8.0, 0.5
+# Low-pass of the rates, its length on either side, and the rate that is enough after it: it falls to nothing at
+# f_c + π/side, 14 Hz.
+FINE_CUTOFF_HZ, FINE_SIDE_S, FINE_RATE_HZ = 8.0, 0.5, 50.0
 # The lag anew from slower motion alone: a VPS that smooths, or whose error goes with the motion, is not late by one
 # time at all frequencies. Length of that low-pass on either side, the rate that is enough after it, fewest rows.
 SLOWER_CUTOFF_HZ, SLOWER_SIDE_S, SLOWER_RATE_HZ, FEWEST_SLOWER = 2.0, 1.5, 40.0, 200
@@ -340,7 +342,8 @@ def refined(
     """The clock by the vector rates from lag, s at mid-record, and skew (a ratio) nearby; judged. Adds to `measured`.
 
     Raises UnusableFlight with `clock_rates_differ`, `not_the_same_motion`, `flat_peak`."""
-    fit = _refine(imu, vps, lag_s, float(t_imu[0]), 0.5 * float(t_imu[0] + t_imu[-1]), measured, skew=skew)
+    middle = 0.5 * float(t_imu[0] + t_imu[-1])
+    fit = _refine(_thinned(imu, FINE_RATE_HZ), vps, lag_s, float(t_imu[0]), middle, measured, skew=skew)
     measured |= {"explained": fit.explained, "skew_ppm": fit.skew_ppm, "lag_sd_s": fit.lag_sd_s}
     if fit.explained >= SURELY_EXPLAINED and abs(fit.skew_ppm) > MAX_SKEW_PPM and fit.lag_sd_s <= MAX_LAG_SD_S:
         raise UnusableFlight(
@@ -371,7 +374,7 @@ def refined(
 def _spread(imu: UniformRates, vps: UniformRates, fit: SyncFit, measured: dict[str, float]) -> Array:
     """Half of what lag, s, and skew (a ratio) by slower motion differ from the fit's, the chance of both taken off, as
     an sd (2,); 0 where too little of the record is far enough from gaps to tell."""
-    own, other = (_thinned(_smoothed(r, SLOWER_CUTOFF_HZ, SLOWER_SIDE_S)) for r in (imu, vps))
+    own, other = (_thinned(_smoothed(r, SLOWER_CUTOFF_HZ, SLOWER_SIDE_S), SLOWER_RATE_HZ) for r in (imu, vps))
     if _both_valid(own, other, fit.to_vps_clock(own.t)).sum() < FEWEST_SLOWER:
         return np.zeros(2)
     slower = _refine(own, other, fit.lag_mid_s, fit.first_s, fit.reference_s, measured, skew=1e-6 * fit.skew_ppm)
@@ -380,9 +383,9 @@ def _spread(imu: UniformRates, vps: UniformRates, fit: SyncFit, measured: dict[s
     return np.asarray(0.5 * np.sqrt(np.maximum(difference**2 - by_chance, 0.0)))
 
 
-def _thinned(s: UniformRates) -> UniformRates:
-    """Every so many of slow rates, SLOWER_RATE_HZ or more."""
-    every = max(1, int(1.0 / (SLOWER_RATE_HZ * s.interval_s)))
+def _thinned(s: UniformRates, rate_hz: float) -> UniformRates:
+    """Every so many of low-passed rates, `rate_hz` or more."""
+    every = max(1, int(1.0 / (rate_hz * s.interval_s)))
     return UniformRates(s.start_s, every * s.interval_s, s.rate[::every], s.valid[::every])
 
 

@@ -65,11 +65,11 @@ def find_repeats(t: ArrayLike, q: ArrayLike) -> Repeats:
 
 
 def _numbered(q: Array) -> np.ndarray:
-    """A number (n,) for each different row of q (n, 4), from 0; one that is not a number is like no other."""
-    numbers: dict[bytes, int] = {}
+    """A number (n,) for each different row of q (n, 4); one that is not a number is like no other."""
     rows = np.ascontiguousarray(q + 0.0).view(f"V{q.itemsize * q.shape[1]}")[:, 0].tolist()  # −0 is 0
-    value = np.array([numbers.setdefault(row, len(numbers)) for row in rows])
-    return np.where(np.isnan(q).any(axis=1), len(numbers) + np.arange(len(q)), value)
+    last = dict(zip(rows, range(len(rows)), strict=True))
+    value = np.fromiter(map(last.__getitem__, rows), dtype=np.int64, count=len(rows))
+    return np.where(np.isnan(q).any(axis=1), np.arange(len(q)), value)
 
 
 def _angle(a: Array, b: Array) -> Array:
