@@ -58,8 +58,10 @@ class TriadFit:
 
     @property
     def scale_relative_sd(self) -> list[float]:
-        """Claimed sd of the three scales over them."""
-        return [float(v) for v in np.sqrt(np.diagonal(self.covariance)[:3]) / np.abs(self.scale_diagonal)]
+        """Claimed sd of the three scales over them; infinite where rounding left no variance: nothing is known."""
+        variance = np.diagonal(self.covariance)[:3]
+        sd = np.sqrt(np.where(variance > 0.0, variance, np.inf))
+        return [float(v) for v in sd / np.abs(self.scale_diagonal)]
 
     def measured(self) -> dict[str, Json]:
         """The numbers behind the verdict, for the `run` table."""

@@ -201,7 +201,7 @@ def calibrate_accelerometer_gated(tables: Tables, s: GatedAccelerometerSettings)
 
 def _scale_doubt(fit: TriadFit) -> float:
     """Largest claimed relative sd of a scale."""
-    return float(np.max(np.sqrt(np.diagonal(fit.covariance)[:3]) / np.abs(fit.scale_diagonal)))
+    return max(fit.scale_relative_sd)
 
 
 def _gated_fit(source: Array, quiet: np.ndarray, s: GatedAccelerometerSettings) -> TriadFit | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numerics_support import directions
@@ -164,7 +166,7 @@ LIMITS = {"max_condition": 50.0, "max_scale_sd": 0.02, "max_residual": 0.1}
         ({"condition": 50.001}, "too_little_motion", "number 50, at most 50"),
         ({"condition": np.nan}, "too_little_motion", "nan"),
         ({"covariance": np.diag([1e-4, 4.1e-4, 1e-4, 1, 1, 1])}, "scale_uncertain", "2.02 % (one sd); at most 2 %"),
-        ({"covariance": np.full((6, 6), np.nan)}, "scale_uncertain", "nan"),
+        ({"covariance": np.full((6, 6), np.nan)}, "scale_uncertain", "not determined at all"),
         ({"residual_rms": 0.1001}, "not_a_sphere", "10 % rms, above 10 %"),
         ({"residual_rms": np.nan}, "not_a_sphere", "nan"),
     ],
@@ -175,6 +177,22 @@ def test_each_limit_is_allowed_and_no_more(changed: dict[str, object], code: str
         require_determined(fit_of(**changed), **LIMITS)
     assert refused.value.reason_code == code
     assert said in refused.value.sentence
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("variance", [-1e-20, 0.0, np.nan])
+def test_a_variance_that_rounding_took_is_none_that_is_known(axis: int, variance: float) -> None:
+    """Whichever axis has it: the largest of numbers, one of which is none, depends on their order."""
+    z = logged(directions(np.random.default_rng(3), 400), 20.0 * np.random.default_rng(4).normal(size=(400, 3)))
+    found = fit_ellipsoid(z, LENGTH, polarity=POLARITY)
+    covariance = found.covariance.copy()
+    covariance[axis, axis] = variance
+    assert replace(found, covariance=covariance).scale_relative_sd[axis] == np.inf
+    with pytest.raises(UnusableFlight) as caught:
+        require_determined(
+            replace(found, covariance=covariance), max_condition=30.0, max_scale_sd=0.05, max_residual=0.1
+        )
+    assert caught.value.reason_code == "scale_uncertain"
 
 
 def test_a_scale_may_be_half_or_twice_its_nominal_value() -> None:
