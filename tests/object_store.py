@@ -7,6 +7,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.request import Request, urlopen
 
 import boto3
 import moto.settings
@@ -39,6 +40,8 @@ def running_store() -> Iterator[str]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {**KEYS, "AWS_ENDPOINT_URL": address}.items():
             patch.setenv(name, value)
+        # What an earlier server of this process held is still there: moto keeps it in the process, not in the server.
+        urlopen(Request(f"{address}/moto-api/reset", method="POST")).close()
         client = boto3.client("s3", endpoint_url=address, region_name="us-east-1")
         for bucket in BUCKETS:
             client.create_bucket(Bucket=bucket)

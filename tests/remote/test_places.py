@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from object_store import keys, running_store, upload
 
 from fieldcal.cli.main import run
 from fieldcal.errors import FieldcalError
@@ -79,3 +80,12 @@ def test_a_log_is_named_for_another_machine_whatever_lay_there_before(
     )
     with pytest.raises(ValueError, match="another log"):
         received({**named, "files": {"v/s/other": [1, 1]}})
+
+
+def test_a_store_of_these_tests_begins_empty_whatever_another_of_the_process_held(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("1")
+    with running_store():
+        upload(tmp_path, URL)
+        assert list(keys(URL)) == ["a.csv"]
+    with running_store():
+        assert keys(URL) == {}

@@ -17,8 +17,9 @@ from fieldcal.estimation.pooled.unit import (
 )
 from fieldcal.geometry.rotation import Array
 
-FALSE_ALARMS = 0.003
-"""Chance that a unit without any has a step; the same of a steady drift, of a bend, and of a flight left out."""
+FALSE_ALARMS = 0.002
+"""Chance that a unit without any has a step; the same of a steady drift, of a bend, and of a flight left out: of the
+four together below one per cent."""
 FEWEST_TO_CONTRADICT, FEWEST_BESIDE_A_STEP, FEWEST_TO_DRIFT, FEWEST_TO_BEND = 3, 2, 5, 5
 """Sessions that it takes to say of one flight that it contradicts; of either side of a step; of a constant that it
 drifts; at different temperatures, that it bends with temperature."""

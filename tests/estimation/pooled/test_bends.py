@@ -161,11 +161,11 @@ def test_a_bend_that_moves_a_zero_less_than_sessions_scatter_is_not_named_howeve
 
 
 @pytest.mark.parametrize("share", [0.995, 1.005])
-def test_a_bend_is_named_where_one_in_three_hundred_units_would_have_one(share: float) -> None:
+def test_a_bend_is_named_where_one_in_five_hundred_units_would_have_one(share: float) -> None:
     """The coefficient of the square of nine sessions of scatter 1, by its sd in a polynomial."""
     warmth = np.linspace(-20.0, 10.0, 9)
     sd = np.sqrt(np.linalg.inv(np.vander(warmth, 3).T @ np.vander(warmth, 3))[0, 0])
-    size = share * float(norm.isf(0.5 * 0.003)) * sd
+    size = share * float(norm.isf(0.5 * 0.002)) * sd
     found = smoothed(curve(warmth, size * warmth**2, 1.0), only_zero(1.0), (), (), ())
     assert (surest_bend(found, np.full(3, 1e8)) is not None) == (share > 1.0)
 
@@ -175,7 +175,7 @@ def test_a_second_bend_is_as_sure_as_the_first_had_to_be(share: float) -> None:
     """One among two zeros."""
     warmth, other = np.linspace(-20.0, 10.0, 9), ("gyroscope", "zero", "y")
     sd = np.sqrt(np.linalg.inv(np.vander(warmth, 3).T @ np.vander(warmth, 3))[0, 0])
-    size = share * float(norm.isf(0.5 * 0.003 / 2)) * sd
+    size = share * float(norm.isf(0.5 * 0.002 / 2)) * sd
     flights = [
         Flight(NormalEquations((ZERO, other), np.zeros(2), 1e6 * np.array([w**2, size * w**2]), 1e6 * np.eye(2)), k, w)
         for k, w in enumerate(map(float, warmth))

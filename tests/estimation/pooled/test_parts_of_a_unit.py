@@ -365,7 +365,7 @@ def test_of_a_constant_of_which_the_last_session_says_next_to_nothing_there_is_n
 
 
 @pytest.mark.parametrize("share", [0.995, 1.005])
-def test_a_step_a_drift_and_a_contradiction_are_named_where_one_in_three_hundred_units_would_have_one(
+def test_a_step_a_drift_and_a_contradiction_are_named_where_one_in_five_hundred_units_would_have_one(
     share: float,
 ) -> None:
     """By what a normal number exceeds, among all that are looked at: three places of a step, one rate, nine flights.
@@ -374,7 +374,7 @@ def test_a_step_a_drift_and_a_contradiction_are_named_where_one_in_three_hundred
     sure = np.array([1e8])
 
     def beyond(among: int) -> float:
-        return share * float(norm.isf(0.5 * 0.003 / among))
+        return share * float(norm.isf(0.5 * 0.002 / among))
 
     day = np.arange(6.0)
     step = beyond(3) * np.sqrt(2.0 / 3.0) * (day >= 3)
