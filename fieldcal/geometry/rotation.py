@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fieldcal import compiled
-from fieldcal.compiled import between
+from fieldcal.compiled import quaternions
 from fieldcal.geometry.intervals import interval_of, share_of_interval
 
 Array = NDArray[np.floating]  # of any width, because numpy.linalg's answers are so to the type check
@@ -33,6 +33,8 @@ def conjugate(q: ArrayLike) -> Array:
 def multiply(p: ArrayLike, q: ArrayLike) -> Array:
     """Product p ⊗ q, scalar last, so that as body-to-inertial rotations R(p ⊗ q) = R(p) R(q). Broadcasts."""
     p, q = np.asarray(p, dtype=float), np.asarray(q, dtype=float)
+    if compiled.LIBRARY is not None and max(p.ndim, q.ndim) == 2 and (p.ndim != q.ndim or len(p) == len(q)):
+        return quaternions.multiply(compiled.LIBRARY, p, q)
     px, py, pz, pw = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     qx, qy, qz, qw = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     out = np.empty((*np.broadcast_shapes(p.shape[:-1], q.shape[:-1]), 4))
@@ -200,7 +202,7 @@ def hermite(t: ArrayLike, q: ArrayLike, rate: ArrayLike, at: ArrayLike) -> Array
     rate (NaN) fall back on it."""
     t, q, rate, at = (np.asarray(x, dtype=float) for x in (t, q, rate, at))
     if compiled.LIBRARY is not None and len(t) > 1:
-        return between.hermite(compiled.LIBRARY, t, q, rate, at)
+        return quaternions.hermite(compiled.LIBRARY, t, q, rate, at)
     i = interval_of(t, at)
     step = t[i + 1] - t[i]
     u = share_of_interval(t, i, at)[:, None]
@@ -217,7 +219,7 @@ def slerp(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:
     Times outside t take the nearest end; mask them. Does not look for gaps: mask those too."""
     t, q, at = np.asarray(t, dtype=float), np.asarray(q, dtype=float), np.asarray(at, dtype=float)
     if compiled.LIBRARY is not None and len(t) > 1:
-        return between.slerp(compiled.LIBRARY, t, q, at)
+        return quaternions.slerp(compiled.LIBRARY, t, q, at)
     i = interval_of(t, at)
     step = to_rotation_vector(multiply(conjugate(q[i]), q[i + 1]))
     return continuous(multiply(q[i], from_rotation_vector(share_of_interval(t, i, at)[:, None] * step)))

@@ -256,8 +256,8 @@ def _predicted(
     state = replace(state, values=constants.state.values)
     reference = None
     if vps is not None and constants.vps is not None and noise.vps is not None:
-        sigma = noise.vps.sigma(noise.model, noise.state)
-        reference = replace(constants.vps, used=vps.used, sigma_rad=sigma)
+        residual, counts = noise.vps.residual(noise.model, noise.state)
+        reference = replace(constants.vps, used=vps.used, sigma_rad=noise.vps.sigma(residual[counts]))
     free = {name: v for name, v in state.values.items() if name in TERMS or name in PARAMETERS}
     layout, p = layout_of(model, free, dip=False, lever_arm=False)
     probe = Probe.draw(model.knots, model.readings.t, model.at, 3 * len(model.vectors))

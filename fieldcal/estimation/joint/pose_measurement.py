@@ -153,7 +153,7 @@ class VpsRecord:
         """Add the poses to the normal equations."""
         p = len(normal.parameters)
         residual, available = self.residual(model, state)
-        weight = available / self.sigma(model, state) ** 2
+        weight = available / self.sigma(residual[available]) ** 2
         g = self.sensitivity(model, state, path, layout, p)
         weighted = g * weight[:, None, None]
         normal.diagonal[:, range(3), range(3)] += weight[:, None]
@@ -169,11 +169,11 @@ class VpsRecord:
         """Sensitivities (K, 3, p), knots eliminated by their `response` (K, s, p) to the parameters, and residuals
         (K, 3), both over the noise; 0 where no pose counts."""
         residual, available = self.residual(model, state)
-        root = (available / self.sigma(model, state))[:, None]
+        root = (available / self.sigma(residual[available]))[:, None]
         left = self.sensitivity(model, state, path, layout, response.shape[2]) - response[:, :3]
         return left * root[..., None], residual * root
 
-    def sigma(self, model: Model, state: State) -> float:
-        """Noise of a pose, rad an axis: that from sample to sample or, where larger, that of the residuals."""
-        residual, available = self.residual(model, state)
-        return max(self.sigma_rad, robust_sigma(residual[available]))
+    def sigma(self, residual: Array) -> float:
+        """Noise of a pose, rad an axis: that from sample to sample or, where larger, that of the residuals (k, 3) that
+        count."""
+        return max(self.sigma_rad, robust_sigma(residual))

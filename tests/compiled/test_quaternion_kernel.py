@@ -1,4 +1,4 @@
-"""Attitudes between stamps by the compiled kernel against their NumPy counterparts."""
+"""Products and attitudes between stamps by the compiled kernel against their NumPy counterparts."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fieldcal import compiled
-from fieldcal.geometry.rotation import Array, hermite, normalise, slerp
+from fieldcal.geometry.rotation import Array, hermite, multiply, normalise, slerp
 
 pytestmark = pytest.mark.skipif(compiled.LIBRARY is None, reason="No kernel was compiled, or FIELDCAL_KERNEL=numpy.")
 N = 400
@@ -50,6 +50,23 @@ def test_attitudes_between_stamps_are_the_same(which: str, monkeypatch: pytest.M
         np.testing.assert_allclose(mine, oracle, rtol=0.0, atol=1e-13)
 
 
+@pytest.mark.parametrize(
+    ("p", "q"),
+    [((N, 4), (N, 4)), ((N, 4), (4,)), ((4,), (N, 4)), ((1, 4), (1, 4)), ((0, 4), (4,)), ((1, 4), (N, 4)), ((4,), (4,)),
+     ((3, 1, 4), (N, 4))],
+)  # fmt: skip
+def test_products_are_the_same(p: tuple[int, ...], q: tuple[int, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    a, b = rng.normal(size=p), rng.normal(size=q)
+    a[..., 2][a[..., 1] > 2.0] = np.nan
+    strided = np.asfortranarray(b)[..., ::-1]
+    own = multiply(a, b), multiply(a, strided)
+    monkeypatch.setattr(compiled, "LIBRARY", None)
+    for mine, oracle in zip(own, (multiply(a, b), multiply(a, strided)), strict=True):
+        assert mine.shape == oracle.shape
+        np.testing.assert_allclose(mine, oracle, rtol=0.0, atol=1e-14)
+
+
 def test_of_two_stamps_and_of_attitudes_that_are_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     q = normalise(np.array([[0.1, -0.3, 0.2, 0.9], [0.1, -0.3, 0.2, 0.9]]))
     at = np.array([-1.0, 0.0, 0.3, 1.0, 2.0])
@@ -65,3 +82,5 @@ def test_other_shapes_are_refused() -> None:
         slerp(t, q[:-1], t)
     with pytest.raises(ValueError, match="instead of"):
         hermite(t, q, rate[:, :2], t)
+    with pytest.raises(ValueError, match="instead of"):
+        multiply(q[:, :3], q)

@@ -1,4 +1,5 @@
-"""Attitudes between stamps in C (`between.c`): wrappers that check shapes. Names are those of `geometry.rotation`."""
+"""Products of quaternions and attitudes between stamps in C (`quaternions.c`): wrappers that check shapes. Names are
+those of `geometry.rotation`."""
 
 from __future__ import annotations
 
@@ -7,6 +8,16 @@ import ctypes
 import numpy as np
 
 from fieldcal.compiled import pointer, real
+
+
+def multiply(library: ctypes.CDLL, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """p ⊗ q of two of (n, 4), or of one of (n, 4) and one of (4,)."""
+    n = max(len(x) for x in (p, q) if x.ndim == 2)
+    given, out = [real(x, n, 4) if x.ndim == 2 else real(x, 4) for x in (p, q)], np.empty((n, 4))
+    steps = (ctypes.c_int64(4 * (x.ndim - 1)) for x in given)
+    with_steps = [one for step, x in zip(steps, given, strict=True) for one in (step, pointer(x))]
+    library.products(ctypes.c_int64(n), *with_steps, pointer(out))
+    return out
 
 
 def slerp(library: ctypes.CDLL, t: np.ndarray, q: np.ndarray, at: np.ndarray) -> np.ndarray:

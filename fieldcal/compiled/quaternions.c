@@ -1,8 +1,15 @@
-/* Attitudes between stamps, as in fieldcal/geometry/rotation.py, whose NumPy code is the reference. n >= 2 stamps t,
- * ascending, s, of attitudes q (n, 4); m times `at`. */
+/* Products of quaternions and attitudes between stamps, as in fieldcal/geometry/rotation.py, whose NumPy code is the
+ * reference. n >= 2 stamps t, ascending, s, of attitudes q (n, 4); m times `at`. */
 #include "rotation.h"
 #include <stdint.h>
 #include <string.h>
+
+/* out (n, 4) = p (x) q, each of which is (n, 4), or (4,) where its step is 0: `multiply`. */
+EXPORTED void products(int64_t n, int64_t step_p, const double *p, int64_t step_q, const double *q, double *out)
+{
+    for (int64_t k = 0; k < n; k++)
+        multiply(p + step_p * k, q + step_q * k, out + 4 * k);
+}
 
 /* Interval [t_i, t_i+1] of a time, the first or last of one outside: `interval_of`. Looked for from `near` on, for
  * times mostly rise. */
