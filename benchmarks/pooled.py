@@ -333,7 +333,10 @@ def alarms(fleets: int, units: int = 12, counts: Sequence[int] = (4, 8, 12, 24))
                 rng = np.random.default_rng([sessions, number])
                 drawn_units = [drawn(rng, sessions, seen=12) for _ in range(units)]
                 kinds = strengths(drawn_units)
-                wrong += sum(bool(p.steps or p.left_out or p.bent or p.drifting) for p in (pool(unit, kinds) for unit in drawn_units))
+                wrong += sum(
+                    bool(p.steps or p.left_out or p.bent or p.drifting)
+                    for p in (pool(unit, kinds) for unit in drawn_units)
+                )
                 place = int(rng.integers(18))
                 stepped = pool(drawn(rng, sessions, seen=12, step=(sessions // 2, place, 10.0)), kinds)
                 hits += any(s.name == NAMES[place] and s.after == sessions // 2 for s in stepped.steps)

@@ -48,7 +48,9 @@ def require_determined(
                 measured,
             )
     if not relative <= max_scale_sd:
-        uncertain = f"uncertain by {100 * relative:.3g} % (one sd)" if np.isfinite(relative) else "not determined at all"
+        uncertain = (
+            f"uncertain by {100 * relative:.3g} % (one sd)" if np.isfinite(relative) else "not determined at all"
+        )
         raise UnusableFlight(
             ReasonCode.SCALE_UNCERTAIN,
             f"A scale is {uncertain}; at most {100 * max_scale_sd:.3g} % is accepted.",

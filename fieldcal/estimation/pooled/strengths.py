@@ -126,7 +126,8 @@ def strengths_of(series: Series, *, with_slope: bool = True, within: Array = NO_
     Few innovations cannot tell a little from nothing: then the scatter, and what the slope does over the temperatures
     flown, are taken for half of a session's own sd. Nor can they tell a walk or a slope from scatter: what may be
     either is scatter. A walk is what it is on average of all that it may be (`mean_of_variance`): one of a few per cent
-    of the scatter a √day, which doubles the sd of the mean of twenty sessions, is often likeliest to be none. Without any two sessions to compare nothing is known to move, but the scatter is that."""
+    of the scatter a √day, which doubles the sd of the mean of twenty sessions, is often likeliest to be none. Without
+    any two sessions to compare nothing is known to move, but the scatter is that."""
     known = np.isfinite(series.value)
     if not known.any():
         return Strengths(0.0, 0.0, 0.0, FEW)
@@ -219,7 +220,8 @@ def unlikely(ratio: float) -> float:
 def mean_of_variance(cost: Callable[[Array], float], best: Array, least: float, i: int) -> float:
     """Logarithm of the mean of variance i over all that it may be by the likelihood, any sd as likely as another
     beforehand, the other elements of x as they are."""
-    u = np.linspace(*np.arcsinh((np.array(LIMITS) - best[i]) / NEAR), LOOKED_AT)
+    first, last = np.arcsinh((np.array(LIMITS) - best[i]) / NEAR)
+    u = np.linspace(first, last, LOOKED_AT)
     x = np.repeat(best[None], LOOKED_AT, axis=0)
     x[:, i] += NEAR * np.sinh(u)
     likely = np.cosh(u) * np.exp(0.5 * (least - np.array(list(map(cost, x))) + x[:, i]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-
 from functools import partial
 
 import numpy as np

@@ -239,7 +239,6 @@ def test_strengths_are_the_largest_that_are_likely_by_all_that_counts(monkeypatc
 
     best = minimize(cost, np.full(3, 1.0), method="Powell", options={"xtol": 1e-7, "ftol": 1e-12})
 
-
     def likely(walk_sd: float) -> float:
         x = np.r_[2.0 * np.log(walk_sd), best.x[1:]]
         return float(np.exp(0.5 * (best.fun - cost(x))))
