@@ -109,12 +109,14 @@ def finite(own: tuple[Array, Array]) -> bool:
 
 def counting(calibration: pl.DataFrame, sensor: Sensor) -> pl.DataFrame:
     """A sensor's rows by the method that counts: of those with a scale published the most exact, else of all."""
-    scales = calibration.filter(pl.col("sensor") == sensor, pl.col("parameter") == "scale")
-    published = scales.filter(pl.col("status") == Status.OK)
-    methods = (scales if published.is_empty() else published)["method"].unique().to_list()
+    rows = list(calibration.select("sensor", "parameter", "method", "status").iter_rows())
+    scales = [(method, status) for own, parameter, method, status in rows if (own, parameter) == (sensor, "scale")]
+    published = [method for method, status in scales if status == Status.OK]
+    methods = published or [method for method, _ in scales]
     if not methods:
         return calibration.clear()
-    return calibration.filter(pl.col("sensor") == sensor, pl.col("method") == min(methods, key=exactness))
+    best = min(methods, key=exactness)
+    return calibration[[i for i, (own, _, method, _) in enumerate(rows) if (own, method) == (sensor, best)]]
 
 
 def lengths(samples: pl.DataFrame, calibration: pl.DataFrame, name: Sensor) -> Array | None:

@@ -91,7 +91,7 @@ def read_flight(
     flight = typed(map(unfolded, rows_of(_one_flight(warehouse, flight_id))), UnfoldedFlight)[0]
     ids = {"vehicle_id": flight["vehicle_id"], "flight_id": flight["flight_id"]}
     every = {name: warehouse.scan(name, **ids).collect() for name in ("calibration", "fit", "sync", "run")}
-    history = {name: rows.filter("is_primary") for name, rows in every.items()}
+    history = {name: rows if rows["is_primary"].all() else rows.filter("is_primary") for name, rows in every.items()}
     order = {stage: i for i, stage in enumerate(("ingest", *(stage.name for stage in PIPELINE)))}
     run = typed(map(unfolded, rows_of(history["run"])), UnfoldedRun)
     run.sort(key=lambda row: order.get(row["stage"], len(order)))

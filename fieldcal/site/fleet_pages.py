@@ -154,13 +154,13 @@ def fleet_data(warehouse: Warehouse, fitness: Mapping[str, Fitness]) -> Json:
 def constants_data(rows: pl.DataFrame, value: str) -> list[Json]:
     """Constants for comparing, in words and numbers, of several methods the most exact. `value`: its column in `rows`,
     beside sensor, method, parameter, axis, unit and sd."""
-    named = rows_written(rows.with_columns(value=pl.col(value)), ("value", "sd"))
-    if "status" in named.columns:
-        named = named.filter(pl.col("status") == Status.OK)
-    exact = named.with_columns(rank=pl.col("method").map_elements(exactness, return_dtype=pl.Int64))
-    exact = exact.filter(pl.col("axis").str.len_chars() <= 1)  # off-diagonal terms are on the pages themselves
-    best = exact.sort("rank").unique(["sensor", "parameter", "axis"], keep="first", maintain_order=True)
-    named = best.sort("sensor", "parameter", "axis")
+    valued = rows if value == "value" else rows.with_columns(value=pl.col(value))
+    named = typed(rows_written(valued, ("value", "sd")).iter_rows(named=True), CalibrationRow)
+    # Off-diagonal terms are on the pages themselves.
+    told = [row for row in named if row.get("status", Status.OK) == Status.OK and len(row["axis"]) <= 1]
+    best: dict[tuple[str, str, str], CalibrationRow] = {}
+    for row in sorted(told, key=lambda own: exactness(own["method"])):
+        best.setdefault((row["sensor"], row["parameter"], row["axis"]), row)
     return [
         {
             "place": f"{row['sensor']} {shown(row['parameter'])} {shown(row['axis'])}",
@@ -170,7 +170,7 @@ def constants_data(rows: pl.DataFrame, value: str) -> list[Json]:
             "sd": row["sd"],
             "text": scientific(row["value"], row["sd"]),
         }
-        for row in typed(named.iter_rows(named=True), CalibrationRow)
+        for _, row in sorted(best.items())
         if row["value"] is not None and row["value"] == row["value"]
     ]
 

@@ -65,13 +65,14 @@ def _readings(data: FlightData, sensor: Sensor, origin: int, charts: Charts) -> 
 
 def _calibration(data: FlightData, sensor: Sensor) -> tuple[tuple[Array, Array], str] | None:
     """Scale, bias and unit of what they give; None without constants of every axis."""
-    rows = counting(data.calibration, sensor).filter(pl.col("value").is_not_null())
-    whole = {(p, a) for p, a in rows.select("parameter", "axis").iter_rows()}
-    if not whole >= {(p, a) for p in ("scale", "bias") for a in AXES}:
+    rows = counting(data.calibration, sensor)
+    if rows["value"].null_count():
+        rows = rows.filter(pl.col("value").is_not_null())
+    unit = {(p, a): unit for p, a, unit in rows.select("parameter", "axis", "unit").iter_rows()}
+    if not unit.keys() >= {(p, a) for p in ("scale", "bias") for a in AXES}:
         return None
     own = constants(rows, sensor, refused_too=True)
-    bias = rows.filter(pl.col("parameter") == "bias")
-    return None if own is None or not finite(own) else (own, logged_unit(bias["unit"][0]))
+    return None if own is None or not finite(own) else (own, logged_unit(unit["bias", "x"]))
 
 
 def _view(name: str, t: Array, values: Array, own_unit: str) -> View:

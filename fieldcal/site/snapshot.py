@@ -34,6 +34,7 @@ class Snapshot(Warehouse):
         super().__init__(root)
         self._tables: dict[str, pl.DataFrame] = {}
         self._vehicle: tuple[str, dict[str, pl.DataFrame]] = "", {}
+        self._flights: dict[str, dict[str, pl.DataFrame]] = {}
         self._parts: dict[tuple[str, str], dict[str, pl.DataFrame]] = {}
         self._answers: dict[tuple[str, tuple[SqlValue, ...]], pl.DataFrame] = {}
 
@@ -45,7 +46,7 @@ class Snapshot(Warehouse):
             if vehicle_id is None:
                 return super().scan(table, flight_id=flight_id)
             rows = self._of_vehicle(table, vehicle_id)
-            return (rows if flight_id is None else rows.filter(pl.col("flight_id") == flight_id)).lazy()
+            return (rows if flight_id is None else self._of_flight(table, rows, flight_id)).lazy()
         rows = self._whole(table)
         for column, wanted in (("vehicle_id", vehicle_id), ("flight_id", flight_id)):
             if wanted is not None and (column == "vehicle_id" or vehicle_id is None):
@@ -80,15 +81,24 @@ class Snapshot(Warehouse):
 
     def _of_vehicle(self, table: str, vehicle_id: str) -> pl.DataFrame:
         if self._vehicle[0] != vehicle_id:
-            self._vehicle = vehicle_id, {}
+            self._vehicle, self._flights = (vehicle_id, {}), {}
         kept = self._vehicle[1]
         if table not in kept:
             kept[table] = super().scan(table, vehicle_id=vehicle_id).collect()
         return kept[table]
 
+    def _of_flight(self, table: str, rows: pl.DataFrame, flight_id: str) -> pl.DataFrame:
+        if table not in self._flights:
+            self._flights[table] = _by(rows, "flight_id")
+        return self._flights[table].get(flight_id, rows.clear())
+
     def _part(self, table: str, column: str, rows: pl.DataFrame) -> dict[str, pl.DataFrame]:
         key = (table, column)
         if key not in self._parts:
-            parts = rows.partition_by(column, as_dict=True, maintain_order=True)
-            self._parts[key] = {str(name): part for (name,), part in parts.items()}
+            self._parts[key] = _by(rows, column)
         return self._parts[key]
+
+
+def _by(rows: pl.DataFrame, column: str) -> dict[str, pl.DataFrame]:
+    parts = rows.partition_by(column, as_dict=True, maintain_order=True)
+    return {str(name): part for (name,), part in parts.items()}
