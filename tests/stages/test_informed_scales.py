@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import polars as pl
 import pytest
 
 from fieldcal.estimation.joint.problem import PriorConstants
+from fieldcal.names import Sensor
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.simulation.archive import settings, signals
+from fieldcal.simulation.archive import settings, signals, truth
 from fieldcal.simulation.experiment import simulate
-from fieldcal.stages.joint.judgement import informed
+from fieldcal.simulation.ordinary import ordinary_flight
+from fieldcal.stages.joint.judgement import MAX_LEVEL_SCALE_SD, informed
 from fieldcal.stages.pipeline import run_flight
 
 PRIOR = PriorConstants(np.ones(3), np.zeros(3), np.diag([0.03**2] * 3 + [0.1**2] * 3))
@@ -41,3 +44,21 @@ def test_an_axis_about_which_a_vehicle_hardly_turns_has_no_scale_of_its_prior() 
     for k, row in enumerate(own.filter(parameter="zero").iter_rows(named=True)):
         assert row["status"] == "ok"
         assert abs(row["value"] + bias["gyroscope"][k] / scale["gyroscope"][k]) < 4.0 * row["sd"]
+
+
+@pytest.mark.parametrize("seed", [1, 3, 9])
+def test_a_flight_that_banks_to_accelerate_tells_no_scale_of_its_magnetometer_without_a_velocity(seed: int) -> None:
+    """It feels gravity along its own axes and seems to stay level. The zero is told."""
+    r = simulate(ordinary_flight("mission", seed))
+    given = settings(r.experiment, method="auto", use_velocity=False)
+    joint = run_flight(signals(r), given)["joint"]
+    assert joint.measured["rung"] == "held"
+    own = joint.tables["calibration"].filter(sensor="magnetometer")
+    scales = own.filter(parameter="scale", status="ok").filter(pl.col("axis").str.len_chars() == 1)
+    assert all(row["sd"] < MAX_LEVEL_SCALE_SD * row["value"] for row in scales.iter_rows(named=True))
+    assert scales.height < 3
+    zeros = own.filter(parameter="zero", status="ok")
+    assert zeros.height >= 2
+    for row in zeros.iter_rows(named=True):
+        expected = truth(r)["constants"][Sensor.MAGNETOMETER]["zero"]["xyz".index(row["axis"])]
+        assert abs(row["value"] - expected) < 4.0 * row["sd"]
