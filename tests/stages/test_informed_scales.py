@@ -62,3 +62,25 @@ def test_a_flight_that_banks_to_accelerate_tells_no_scale_of_its_magnetometer_wi
     for row in zeros.iter_rows(named=True):
         expected = truth(r)["constants"][Sensor.MAGNETOMETER]["zero"]["xyz".index(row["axis"])]
         assert abs(row["value"] - expected) < 4.0 * row["sd"]
+
+
+@pytest.mark.parametrize("motion", ["hover", "mission"])
+def test_what_a_level_flight_does_not_tell_alone_counts_nowhere_without_a_velocity(motion: str) -> None:
+    """A tilt that nobody sees moves scales the same way in every flight: pooled they would be surer and as wrong."""
+    r = simulate(ordinary_flight(motion, 3))
+    given = settings(r.experiment, method="auto", use_velocity=False)
+    joint = run_flight(signals(r), given)["joint"]
+    rows, information = joint.tables["calibration"], joint.tables["information"]
+    told = rows.filter(parameter="scale", status="ok").select("sensor", "axis").rows()
+    counting = information.filter(status="ok")
+    assert counting.filter(parameter="gain").select("sensor", "axis").rows() == told
+    zeros = rows.filter(parameter="zero", sensor="gyroscope", status="ok")
+    assert counting.filter(parameter="zero", sensor="gyroscope").height == zeros.height
+    counted = counting.filter(parameter="cross")["sensor"].unique().to_list()
+    assert all(len([one for one in told if one[0] == sensor]) == 3 for sensor in counted)
+
+
+def test_with_a_velocity_what_is_uncertain_alone_counts() -> None:
+    r = simulate(ordinary_flight("hover", 3))
+    information = run_flight(signals(r), settings(r.experiment, method="auto"))["joint"].tables["information"]
+    assert information.filter(sensor="magnetometer", parameter="gain", status="ok").height == 3

@@ -26,7 +26,13 @@ from fieldcal.estimation.normal_equations import Name, NormalEquations
 from fieldcal.geometry.rotation import Array
 from fieldcal.names import Sensor, Status
 from fieldcal.reason_codes import ReasonCode
-from fieldcal.stages.joint.judgement import MAX_GYRO_NOISE_SHARE, SCALE_ALONE, axis_noise_share
+from fieldcal.stages.joint.judgement import (
+    MAX_GYRO_NOISE_SHARE,
+    MAX_LEVEL_SCALE_SD,
+    SCALE_ALONE,
+    axis_noise_share,
+    stays_level,
+)
 from fieldcal.stages.tables import AXES
 
 Codes = Mapping[Sensor, Collection[ReasonCode | None]]
@@ -64,7 +70,7 @@ def information_of(
         if isinstance(triad, TriadByPose) and sensor in codes:
             found = beside(found.of([n for n in found.names if n[0] != sensor]), information_by_pose(triad, sensor))
     found = found.of([name for name in found.names if name[0] in codes])
-    refused = _contradicted(fit, codes)
+    refused = _hidden(fit, codes, found.names) | _contradicted(fit, codes)
     return table_of(
         found, [refused.get(name) or refused.get((name[0], "", "")) for name in found.names], units
     ).with_columns(temperature_degc=pl.lit(temperature_degc, pl.Float64))
@@ -80,6 +86,29 @@ def _contradicted(fit: JointFit, codes: Codes) -> dict[Name, ReasonCode]:
     for axis, share in zip(AXES, axis_noise_share(fit), strict=True):
         if share > MAX_GYRO_NOISE_SHARE:
             out[Sensor.GYROSCOPE, GAIN, axis] = ReasonCode.AXIS_NOT_TURNED
+    return out
+
+
+def _hidden(fit: JointFit, codes: Codes, names: Collection[Name]) -> dict[Name, ReasonCode]:
+    """Of a vehicle that stays level: what is not told as a row counts nowhere, since a tilt that nobody sees moves it
+    by per cents, the same way in every such flight, which no number of them averages out."""
+    if not stays_level(fit):
+        return {}
+    untold = {(str(sensor), axis): code for sensor, own in codes.items() for axis, code in zip(AXES, own, strict=True)}
+    whole = {sensor for sensor, own in codes.items() if not any(own)}
+    _, _, covariance = fit.constants("magnetometer") if "magnetometer" in fit.layout else (0, 0, np.zeros((6, 6)))
+    zero_share = np.sqrt(np.diagonal(covariance)[3:]) / np.linalg.norm(fit.model.readings.field_ned)
+    out: dict[Name, ReasonCode] = {}
+    for name in names:
+        sensor, parameter, axis = name
+        if parameter == GAIN:
+            hidden = untold.get((sensor, axis)) is not None
+        elif parameter == ZERO:
+            hidden = sensor == Sensor.MAGNETOMETER and bool(zero_share[AXES.index(axis)] > MAX_LEVEL_SCALE_SD)
+        else:
+            hidden = parameter == CROSS_AXIS and sensor not in whole
+        if hidden:
+            out[name] = untold.get((sensor, axis)) or ReasonCode.SCALE_UNCERTAIN
     return out
 
 
