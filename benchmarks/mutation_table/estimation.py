@@ -320,18 +320,6 @@ EQUIVALENT: dict[tuple[str, str, str, str], str] = {
         "density = 1.0 + 2.0 * (taper @ of_lag[1:]) / np.maximum(of_lag[0], 1e-300)",
         "1e-300 → 1.1000000000000002e-300",
     ): GUARD,
-    (
-        "estimation.theil",
-        "theil",
-        "cross = np.mean((z - z.mean(axis=0)) * (y - y.mean(axis=0)), axis=0)",
-        "- → +",
-    ): "the other factor's mean is 0",
-    (
-        "estimation.theil",
-        "theil",
-        "cross = np.mean((z - z.mean(axis=0)) * (y - y.mean(axis=0)), axis=0)",
-        "- → + #2",
-    ): "the other factor's mean is 0",
     ("estimation.theil", "theil_attitude", "y[np.sum(z * y, axis=1) < 0] *= -1.0", "* → /"): SAME_MINUS,
     ("estimation.theil", "theil_attitude", "y[np.sum(z * y, axis=1) < 0] *= -1.0", "< → <="): NEVER_MET,
     (
