@@ -104,7 +104,8 @@ def _hidden(fit: JointFit, codes: Codes, names: Collection[Name]) -> dict[Name, 
         if parameter == GAIN:
             hidden = untold.get((sensor, axis)) is not None
         elif parameter == ZERO:
-            hidden = sensor == Sensor.MAGNETOMETER and bool(zero_share[AXES.index(axis)] > MAX_LEVEL_SCALE_SD)
+            known = bool(zero_share[AXES.index(axis)] <= MAX_LEVEL_SCALE_SD)
+            hidden = sensor == Sensor.MAGNETOMETER and not known
         else:
             hidden = parameter == CROSS_AXIS and sensor not in whole
         if hidden:
