@@ -13,10 +13,10 @@ from fieldcal.compiled import pointer, real
 def multiply(library: ctypes.CDLL, p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """p ⊗ q of two of (n, 4), or of one of (n, 4) and one of (4,)."""
     n = max(len(x) for x in (p, q) if x.ndim == 2)
-    given, out = [real(x, n, 4) if x.ndim == 2 else real(x, 4) for x in (p, q)], np.empty((n, 4))
-    steps = (ctypes.c_int64(4 * (x.ndim - 1)) for x in given)
-    with_steps = [one for step, x in zip(steps, given, strict=True) for one in (step, pointer(x))]
-    library.products(ctypes.c_int64(n), *with_steps, pointer(out))
+    p, q = (real(x, n, 4) if x.ndim == 2 else real(x, 4) for x in (p, q))
+    step_p, step_q = (ctypes.c_int64(4 * (x.ndim - 1)) for x in (p, q))
+    out = np.empty((n, 4))
+    library.products(ctypes.c_int64(n), step_p, pointer(p), step_q, pointer(q), pointer(out))
     return out
 
 

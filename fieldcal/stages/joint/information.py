@@ -96,16 +96,17 @@ def _hidden(fit: JointFit, codes: Codes, names: Collection[Name]) -> dict[Name, 
         return {}
     untold = {(str(sensor), axis): code for sensor, own in codes.items() for axis, code in zip(AXES, own, strict=True)}
     whole = {sensor for sensor, own in codes.items() if not any(own)}
-    _, _, covariance = fit.constants("magnetometer") if "magnetometer" in fit.layout else (0, 0, np.zeros((6, 6)))
-    zero_share = np.sqrt(np.diagonal(covariance)[3:]) / np.linalg.norm(fit.model.readings.field_ned)
+    zero_share = dict.fromkeys(AXES, np.inf)
+    if "magnetometer" in fit.layout:
+        sd = np.sqrt(np.diagonal(fit.constants("magnetometer")[2])[3:])
+        zero_share = dict(zip(AXES, sd / np.linalg.norm(fit.model.readings.field_ned), strict=True))
     out: dict[Name, ReasonCode] = {}
     for name in names:
         sensor, parameter, axis = name
         if parameter == GAIN:
             hidden = untold.get((sensor, axis)) is not None
         elif parameter == ZERO:
-            known = bool(zero_share[AXES.index(axis)] <= MAX_LEVEL_SCALE_SD)
-            hidden = sensor == Sensor.MAGNETOMETER and not known
+            hidden = sensor == Sensor.MAGNETOMETER and not zero_share[axis] <= MAX_LEVEL_SCALE_SD
         else:
             hidden = parameter == CROSS_AXIS and sensor not in whole
         if hidden:

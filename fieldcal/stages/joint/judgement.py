@@ -102,7 +102,8 @@ def is_held(prior: PriorConstants) -> bool:
 
 
 def stays_level(fit: JointFit) -> bool:
-    """Whether attitudes are by an accelerometer that is held, in whose axes gravity hardly moves."""
+    """Whether attitudes are by an accelerometer that is held: gravity hardly moves in its axes, or nothing else had a
+    minimum."""
     prior = fit.priors.get("accelerometer")
     return fit.vps is None and "accelerometer" in fit.model.vectors and prior is not None and is_held(prior)
 
